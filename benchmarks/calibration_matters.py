@@ -26,7 +26,7 @@ from benchmarks.report import Row, write_report
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.store.store import CalibrationStore
 from openarm_common.camera.cameras import load_cameras, true_mount
-from openarm_common.resources import config_dir
+from openarm_common.resources import models_dir
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.campaign.mounts import with_mounts
 from openarm_evaluation.campaign.options import parse_seeds
@@ -61,7 +61,7 @@ def main() -> None:
 
 def shipped_mounts() -> Mounts:
     """Of mount seed 1, as calibrated by the suite."""
-    store = CalibrationStore(config_dir() / "calibration" / "mount_seed_1")
+    store = CalibrationStore(models_dir() / "robots" / "openarm_v1" / "calibration" / "mount_seed_1")
     return {name: store.load(name).T_parent_link for name in CAMERAS}
 
 

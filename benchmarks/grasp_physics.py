@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the physics holds what the hand grasps, compared with MuJoCo's own settings in the same run.
 
-    python -m benchmarks.grasp_physics [--quick] [--json PATH]
+    [OPENARM_ROBOT=NAME] python -m benchmarks.grasp_physics [--quick] [--json PATH]
 
 Contact only, position targets at 100 Hz, poses that are off by 3 mm and 3 degrees (1 sigma); 64 to 350 g. About three
 minutes of one core (--quick: one).
@@ -126,7 +126,7 @@ def again_and_again(kind: str, seed: int, physics: PhysicsConfig | None, times: 
     rng, height, flown, fastest = np.random.default_rng(seed), run.position[2], 0, 0.0
     for _ in range(times):
         place, run.speed = run.position, 0.0
-        aim = place[:2] * (1.0, 1.0 if run.side == "right" else -1.0) + rng.normal(0.0, 0.003, 2)
+        aim = place[:2] + rng.normal(0.0, 0.003, 2)
         try:
             run.grasp = run.grasp.at(aim)
             run.approach()

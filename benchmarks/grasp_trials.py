@@ -17,16 +17,18 @@ import numpy as np
 
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.scene import Scene, SceneObject, Table
+from openarm_common.robot.folder import robot_work
+from openarm_common.scene.scene import Scene, SceneObject
 from openarm_common.types import Array
+from openarm_grasp.planning.candidates import tcp_height
+from openarm_motion.kinematics.chain import ArmKinematics, Solution
+from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_sim_bridge.world.model import PhysicsConfig, compile_model
+from openarm_sim_bridge.world.world import start_qpos
 
-mirror = RobotDescription.load().mirrored
-
-TABLE = Table()
-OPEN, LIFT, BACK = 0.044, 0.12, 0.08
-SHOULDER, UPPER, FORE, HAND = np.array([0.0, -0.1535, 0.698]), 0.220, 0.216, 0.1801
-LOWER, UPPER_LIMIT = RobotDescription.load().limits(RobotDescription.load().arm_joints("right"))
+ROBOT, WORK = RobotDescription.load(), robot_work()
+TABLE, MEASURES = WORK.table, next(iter(ROBOT.hands.values())).parts
+OPEN, LIFT, BACK = MEASURES.opening, 0.12, 0.08
 
 OBJECTS = {
     "cube_4cm": ("box", (0.04, 0.04, 0.04), 0.064),
@@ -36,6 +38,8 @@ OBJECTS = {
     "can": ("cylinder", (0.066, 0.066, 0.115), 0.35),
     "cube_8cm": ("box", (0.08, 0.08, 0.08), 0.25),  # leaves 4 mm a side in the open hand
 }
+#: Kept from joint limits, rad.
+_MARGIN = 0.05
 #: MuJoCo's own contact and solver settings, and the finger force of the v2 hand.
 MUJOCO_DEFAULTS = PhysicsConfig(
     integrator="euler",
@@ -50,70 +54,60 @@ MUJOCO_DEFAULTS = PhysicsConfig(
 )
 
 
-def inverse_kinematics(R: Array, p: Array, swivel: float, over: bool) -> Array | None:
-    """Joint positions (7,) of the right arm for a TCP pose at one swivel angle; None outside the limits."""
-    w = p - HAND * R[:, 2] - SHOULDER
-    d = float(np.linalg.norm(w))
-    cos_elbow = (d * d - UPPER**2 - FORE**2) / (2 * UPPER * FORE)
-    if abs(cos_elbow) > 1:
-        return None
-    along = w / d
-    down = np.array([0.0, 0.0, -1.0]) + along * along[2]
-    down /= np.linalg.norm(down)
-    a = (d * d + UPPER**2 - FORE**2) / (2 * d * UPPER)
-    side = math.cos(swivel) * down + math.sin(swivel) * np.cross(along, down)
-    u = a * along + math.sqrt(1 - a * a) * side  # shoulder to elbow
-    q = np.zeros(7)
-    q[1], q[0] = math.asin(-u[1]), math.atan2(u[0], -u[2])
-    if over:
-        q[1], q[0] = math.pi - q[1], math.atan2(-u[0], u[2])
-    q[3] = math.acos(cos_elbow)
-    shoulder = se3.rot_x(math.pi / 2) @ se3.rot_z(q[0]) @ se3.rot_x(math.pi / 2 - q[1])
-    g = shoulder.T @ (w - UPPER * u)
-    q[2] = math.atan2(g[1], g[0])
-    M = (shoulder @ se3.rot_z(q[2]) @ se3.rot_y(q[3])).T @ R
-    q[5] = math.asin(np.clip(M[2, 1], -1, 1))
-    q[4], q[6] = math.atan2(-M[0, 1], M[1, 1]), math.atan2(-M[2, 0], M[2, 2])
-    q[:2] += np.where(q[:2] < LOWER[:2], math.tau, 0.0)
-    return q if ((q >= LOWER) & (q <= UPPER_LIMIT)).all() else None
-
-
 class NoGraspError(Exception):
     """The object lies where this simple search finds no grasp, or a way leads out of reach."""
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """A grasp of the right arm: TCP rotation and position, swivel and branch that the whole approach keeps."""
+    """A grasp of one arm: TCP pose, and the configuration there, whose branch and swivel the whole approach keeps."""
 
-    R: Array
-    p: Array
-    swivel: float
-    over: bool
+    inverse: InverseKinematics
+    T: Array
+    start: Solution
     width: float
 
     def q(self, back: float = 0.0, up: float = 0.0, sideways: float = 0.0) -> Array:
-        """Joint positions (7,) that far behind, above or to the side of the grasp, m.
+        """Joint positions (n,) that far behind, above or to the side of the grasp, m.
 
         Raises:
             NoGraspError: Out of reach.
         """
-        p = self.p - back * self.R[:, 2] + np.array([0.0, 0.0, up]) + sideways * self.R[:, 0]
-        q = inverse_kinematics(self.R, p, self.swivel, self.over)
-        if q is None:
+        T = self.T.copy()
+        T[:3, 3] += np.array([0.0, 0.0, up]) - back * self.T[:3, 2] + sideways * self.T[:3, 0]
+        path, reached, _ = self.inverse.follow(np.stack([self.T, T]), self.start, 0.0, math.pi)
+        if reached < 2:
             raise NoGraspError(f"out of reach: {back:.3f} m back, {up:.3f} m up, {sideways:.3f} m sideways")
-        return q
+        return path[1]
 
     def at(self, xy: Array) -> Grasp:
-        """Return the same grasp above another place (2,), m."""
-        return replace(self, p=np.array([*xy, self.p[2]]))
+        """Return the same grasp above another place (2,), m.
+
+        Raises:
+            NoGraspError: Out of reach.
+        """
+        T = se3.make(self.T[:3, :3], (*xy, self.T[2, 3]))
+        path, reached, _ = self.inverse.follow(np.stack([self.T, T]), self.start, 0.0, math.pi)
+        if reached < 2:
+            raise NoGraspError(f"out of reach: ({xy[0]:.3f}, {xy[1]:.3f}) m")
+        return replace(self, T=T, start=replace(self.start, q=path[1]))
+
+    @property
+    def margin(self) -> float:
+        """Least distance to a joint limit from pre-grasp over grasp to lift, rad; -1 where one is out of reach."""
+        ways = ((0.0, 0.0), (BACK, 0.0), (0.0, LIFT), (BACK / 2, 0.0), (0.0, LIFT / 2))
+        try:
+            return min(self.inverse.kinematics.margin(self.q(back, up)) for back, up in ways)
+        except NoGraspError:
+            return -1.0
 
 
-def grasps(item: SceneObject, error: Array) -> Iterator[Grasp]:
-    """Grasps of an object of the right half, best first: least tilt, then most room to the joint limits.
+def grasps(item: SceneObject, inverse: InverseKinematics, error: Array) -> Iterator[Grasp]:
+    """Grasps of an object, best first: least tilt, then most room to the joint limits.
 
     Args:
         item: The object.
+        inverse: Of the arm.
         error: x, y (m) and yaw (rad) that the grasp is off by.
     """
     x, y, z = item.size
@@ -122,8 +116,7 @@ def grasps(item: SceneObject, error: Array) -> Iterator[Grasp]:
     else:
         faces = sorted([(y, item.yaw), (x, item.yaw + math.pi / 2)])
     for tilt in np.radians([0.0, 15.0, 30.0, 45.0]):
-        height = max(0.012 + 0.018 * math.sin(tilt), z / 2 - 0.017, z - 0.045 + 0.03 * math.sin(tilt))
-        p = np.array([*(np.array(item.position[:2]) + error[:2]), TABLE.top_z + height])
+        p = np.array([*(np.array(item.position[:2]) + error[:2]), TABLE.top_z + tcp_height(z, tilt, MEASURES)])
         found: list[tuple[float, Grasp]] = []
         for width, yaw in faces:
             for turn in (0.0, math.pi):
@@ -132,28 +125,12 @@ def grasps(item: SceneObject, error: Array) -> Iterator[Grasp]:
                 for flip in (1.0, -1.0):
                     across = (-flip * math.sin(heading), flip * math.cos(heading), 0.0)
                     R = se3.rotation_from_z_y(approach, across)
-                    for swivel in np.linspace(-math.pi, math.pi, 24, endpoint=False):
-                        for over in (False, True):
-                            grasp = Grasp(R, p, float(swivel), over, width)
-                            margin = _margin(grasp)
-                            if margin > 0.05:
-                                found.append((margin, grasp))
-        for _, grasp in sorted(found, key=lambda pair: -pair[0])[:6]:
-            yield grasp
-
-
-def _margin(grasp: Grasp) -> float:
-    """Least distance to a joint limit from pre-grasp over grasp to lift, rad; -1 where one is out of reach."""
-    margin = math.inf
-    for back, up in ((0.0, 0.0), (BACK, 0.0), (0.0, LIFT), (BACK / 2, 0.0), (0.0, LIFT / 2)):
-        p = grasp.p - back * grasp.R[:, 2] + np.array([0.0, 0.0, up])
-        q = inverse_kinematics(grasp.R, p, grasp.swivel, grasp.over)
-        if q is None:
-            return -1.0
-        room = np.minimum(q - LOWER, UPPER_LIMIT - q)
-        room[3] += 0.2  # a straight elbow is no hard limit
-        margin = min(margin, float(room.min()))
-    return margin
+                    T = se3.make(R, p - MEASURES.tcp_shift(0.5 * width) * R[:, 2])
+                    ways = (Grasp(inverse, T, solution, width) for solution in inverse.solutions(T, _MARGIN))
+                    found += [(grasp.margin, grasp) for grasp in ways]
+        for margin, grasp in sorted(found, key=lambda pair: -pair[0])[:6]:
+            if margin > _MARGIN:
+                yield grasp
 
 
 def quintic(u: float) -> float:
@@ -162,59 +139,58 @@ def quintic(u: float) -> float:
 
 
 class Trial:
-    """One grasp in a world of its own. The left arm does the mirror image of what the right one would."""
+    """One grasp in a world of its own; an object of the right half stands in the left one for the left arm."""
 
     def __init__(self, item: SceneObject, side: str, error: Array, physics: PhysicsConfig | None = None) -> None:
-        description = RobotDescription.load()
         flipped = item.model_copy(update={"position": (item.position[0], -item.position[1]), "yaw": -item.yaw})
         self.item = item if side == "right" else flipped
-        self.side = side
+        self.side, self.hand = side, ROBOT.hand(side)
         scene = Scene(table=TABLE, objects=(self.item,))
-        self.model = compile_model(description, scene, {}, None, physics)
+        self.model = compile_model(ROBOT, scene, {}, None, physics)
         self.data = mujoco.MjData(self.model)
         self.steps = round(0.01 / self.model.opt.timestep)
-        self.arm = [self.model.actuator(name).id for name in description.arm_joints(side)]
-        self.finger = self.model.actuator(description.finger_joint(side)).id
-        self.tcp = self.model.site(description.tcp_link(side)).id
+        self.arm = [self.model.actuator(name).id for name in ROBOT.arm_joints(side)]
+        self.finger = self.model.actuator(self.hand.joint).id
+        self.tcp = self.model.site(ROBOT.tcp_link(side)).id
         self.body = self.model.body(item.name).id
         self.shape = self.model.geom(item.name).id
-        prefix = f"openarm_{side}_"
-        self.pads = [self.model.geom(f"{prefix}{f}_finger_pad_collision").id for f in ("left", "right")]
-        self.home = description.group_state("both_arms", "home")
+        self.pads = [self.model.geom(f"{link}_pad_collision").id for link in ROBOT.arm(side).fingers]
+        self.joints = [self.hand.joint, *(j.name for j in ROBOT.joints.values() if j.mimic == self.hand.joint)]
+        self.start: dict[str, float] = {}
+        for arm in ROBOT.arm_names:
+            self.start |= ROBOT.group_state(f"{arm}_arm", "home")
+        self.start |= dict.fromkeys(self.joints, self.hand.opened)
         self.penetration = self.speed = 0.0
-        self.grasp = self._choose(item, error)
+        self.grasp = self._choose(error if side == "right" else error * (1.0, -1.0, -1.0))
         self._place(self.grasp.q(BACK))
 
-    def _choose(self, item: SceneObject, error: Array) -> Grasp:
-        for grasp in grasps(item, error):
+    def _choose(self, error: Array) -> Grasp:
+        inverse = InverseKinematics(ArmKinematics(ROBOT, ROBOT.tcp_link(self.side)), 24)
+        for grasp in grasps(self.item, inverse, error):
             ways = (grasp.q(BACK), grasp.q(BACK / 2), grasp.q(), grasp.q(up=LIFT))
             if all(self._free(q) for q in ways):
                 return grasp
-        raise NoGraspError(f"no grasp of {item}")
+        raise NoGraspError(f"no grasp of {self.item}")
 
     def _free(self, q: Array) -> bool:
         self._place(q)
         for contact in self.data.contact:
             names = [self.model.body(self.model.geom_bodyid[g]).name for g in (contact.geom1, contact.geom2)]
-            if any(name.startswith("openarm") for name in names):
+            if not ROBOT.links.keys().isdisjoint(names):
                 return False
         return True
 
     def _place(self, q: Array) -> None:
         mujoco.mj_resetData(self.model, self.data)
-        self.target(q)
-        for name, value in self.home.items():
-            if not name.startswith(f"openarm_{self.side}"):
-                self.data.ctrl[self.model.actuator(name).id] = value
-        self.data.ctrl[self.finger] = OPEN
+        at = self.start | dict(zip(ROBOT.arm_joints(self.side), q.tolist(), strict=True))
+        self.data.qpos[:] = start_qpos(self.model, at)
         for i in range(self.model.nu):
-            self.data.qpos[self.model.jnt_qposadr[self.model.actuator_trnid[i, 0]]] = self.data.ctrl[i]
-        self.data.qpos[self.model.joint(f"openarm_{self.side}_finger_joint2").qposadr[0]] = OPEN
+            self.data.ctrl[i] = at.get(self.model.actuator(i).name, 0.0)
         mujoco.mj_forward(self.model, self.data)
 
     def target(self, q: Array) -> None:
-        """Give the arm a target, of the right arm."""
-        self.data.ctrl[self.arm] = q if self.side == "right" else mirror(q)
+        """Give the arm a target."""
+        self.data.ctrl[self.arm] = q
 
     def run(self, seconds: float, command: Callable[[float], None] = lambda u: None) -> None:
         """Give `command` the share 0 .. 1 of the time that has passed, at 100 Hz, and watch the object."""
@@ -230,18 +206,17 @@ class Trial:
 
     def fingers(self, position: float) -> None:
         """Give the fingers a target, m from the middle."""
-        self.data.ctrl[self.finger] = position
+        self.data.ctrl[self.finger] = self.hand.position(position)
 
     @property
     def gap(self) -> float:
         """Between the fingers, m."""
-        joints = (self.model.joint(f"openarm_{self.side}_finger_joint{i}") for i in (1, 2))
-        return float(sum(self.data.qpos[joint.qposadr[0]] for joint in joints))
+        return sum(self.hand.finger(float(self.data.joint(name).qpos[0])) for name in self.joints)
 
     @property
     def effort(self) -> float:
-        """Of the finger actuator, N."""
-        return abs(float(self.data.actuator_force[self.finger]))
+        """By which the fingers press, N: twice that of a pad."""
+        return abs(float(self.data.actuator_force[self.finger]) / self.hand.lever)
 
     @property
     def position(self) -> Array:
@@ -301,7 +276,8 @@ def make(kind: str, seed: int) -> tuple[SceneObject, Array]:
     """Return an object in the right half of the object region, and the error of a grasp (3 mm, 3 degrees)."""
     rng = np.random.default_rng([seed, *kind.encode()])
     shape, size, mass = OBJECTS[kind]
-    position = (float(rng.uniform(0.18, 0.34)), float(rng.uniform(-0.40, -0.08)))
+    (x_min, x_max), (y_min, y_max) = WORK.region.x, WORK.region.abs_y
+    position = (float(rng.uniform(x_min + 0.02, x_max - 0.02)), float(rng.uniform(0.02 - y_max, -0.02 - y_min)))
     item = SceneObject(
         name=kind, shape=shape, size=size, color="red", mass=mass, position=position, yaw=float(rng.uniform(-3.1, 3.1))
     )

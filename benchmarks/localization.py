@@ -36,7 +36,8 @@ from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.config import load_config
 from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.scene import Scene, SceneObject, Table, random_scene
+from openarm_common.robot.work import Table
+from openarm_common.scene.scene import Scene, SceneObject, random_scene
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
 from openarm_perception.detection.pipeline import Perceived, Pipeline

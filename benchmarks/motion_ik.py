@@ -23,7 +23,8 @@ import pinocchio as pin
 
 from benchmarks.report import Row
 from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.scene import Scene, Table
+from openarm_common.robot.folder import robot_work
+from openarm_common.scene.scene import Scene
 from openarm_common.types import Array
 from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
@@ -248,7 +249,7 @@ class MinkIk:
     def __init__(self, arm: IkArm) -> None:
         self._mink: Any = importlib.import_module("mink")
         importlib.import_module("daqp")
-        model = compile_model(RobotDescription.load(), Scene(name="bench", table=Table(), objects=()), {})
+        model = compile_model(RobotDescription.load(), Scene(name="bench", table=robot_work().table, objects=()), {})
         self._columns = [int(model.joint(name).qposadr[0]) for name in arm.kinematics.names]
         self._dofs = [int(model.joint(name).dofadr[0]) for name in arm.kinematics.names]
         self._configuration = self._mink.Configuration(model)

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.map_scene import MapScene
-from openarm_common.scene.scene import PALETTE, Scene, SceneObject, Table
+from openarm_common.robot.folder import robot_work
+from openarm_common.scene.scene import PALETTE, Scene, SceneObject
 from openarm_motion.collision.occupancy import Environment, OccupancyMap
 from openarm_motion.collision.solids import Box
 from openarm_motion.config import MapConfig
@@ -42,7 +43,7 @@ def rendered(arm: Arm, home: Mapping[str, float], boxes: Sequence[Box], seed: in
         )
         for i, box in enumerate(boxes)
     )
-    place = MapScene(Scene(name="bench", table=Table(), objects=objects))
+    place = MapScene(Scene(name="bench", table=robot_work().table, objects=objects))
     try:
         place.joints = dict(home)
         mapper = Mapper(place.body, GridConfig(), FilterConfig(), FieldConfig())

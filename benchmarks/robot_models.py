@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_motion.collision.exact import Clearance
-from openarm_motion.collision.robot_meshes import load_robot
 from openarm_motion.collision.solids import Solid
 from openarm_motion.config import LimitsConfig, MotionConfig
 from openarm_motion.planning.arm import Arm
@@ -98,7 +98,9 @@ def load_arm(folder: Path, name: str, *, touching: bool = False) -> Arm:
             then. False leaves the defaults.
     """
     model = ROBOTS[name]
-    description = load_robot(folder / "robots" / model.urdf, folder / "robots" / model.srdf, {_PACKAGE: folder})
+    description = RobotDescription.from_files(
+        folder / "robots" / model.urdf, folder / "robots" / model.srdf, {_PACKAGE: folder}
+    )
     config = MotionConfig(arms=(name,), tool_link=model.tool, group=model.group, limits=model.limits)
     if touching:
         planning = config.planning.model_copy(update={"edge_step": _STEP, "edge_travel": _TRAVEL})

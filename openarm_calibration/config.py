@@ -13,6 +13,7 @@ from openarm_calibration.sampling.gate import GateConfig
 from openarm_calibration.sampling.next_pose import SearchConfig
 from openarm_calibration.store.store import StoreConfig
 from openarm_common import se3
+from openarm_common.camera.cameras import near_camera, table_camera
 from openarm_common.config import Config
 
 
@@ -62,7 +63,11 @@ class AutoConfig(Config):
 class CalibrationConfig(StoreConfig):
     """Parameters of the node `calibration`."""
 
-    camera: str = Field(default="wrist", min_length=1, description="name of the camera to calibrate")
+    camera: str = Field(
+        default_factory=lambda: near_camera() or table_camera(),
+        min_length=1,
+        description="name of the camera to calibrate",
+    )
     board: str = Field(
         default="", description="keys of the board as YAML, such as {kind: circles, rows: 11}; empty: defaults"
     )

@@ -11,10 +11,10 @@ import json
 from collections.abc import Hashable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.printable import brief, brief_text
@@ -27,6 +27,16 @@ class Config(BaseModel):
 
 
 ConfigT = TypeVar("ConfigT", bound=BaseModel)
+
+
+def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] < ends[1]:
+        raise ValueError(f"{list(ends)} must ascend: expected [low, high] with low < high")
+    return ends
+
+
+#: Two ends, the lower first.
+Interval = Annotated[tuple[float, float], AfterValidator(_ascending)]
 
 
 #: Longest file or text, bytes, and deepest nesting.

@@ -2,7 +2,7 @@
 """Records that are kept: one YAML each, checked by its own hash, with history and rollback.
 
 Files are written to another name and renamed, so that a reader gets an old or a new one, never a part. A damaged file
-is refused, and the newest good one of the history takes its place.
+and one of another robot are refused, and the newest good one of the history takes their place.
 """
 
 from __future__ import annotations
@@ -19,16 +19,26 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import yaml
+from pydantic import Field
 
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import write_whole
+from openarm_common.robot.folder import DEFAULT, other_robot, robot_name
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
+class OfAnotherRobot(OpenArmError):
+    """A file is of another robot than that of this process."""
+
+
 class Record(Config, ABC):
     """What is stored under a name."""
+
+    robot: str = Field(
+        default_factory=robot_name, description="that it is of; files of old do not say it and are of openarm_v1"
+    )
 
     @property
     @abstractmethod
@@ -36,8 +46,8 @@ class Record(Config, ABC):
         """What it is stored under."""
 
     def fields(self) -> dict[str, Any]:
-        """Return what is written and hashed."""
-        return self.model_dump(mode="json")
+        """Return what is written and hashed; a file of old has no robot and keeps its hash."""
+        return self.model_dump(mode="json", exclude=None if self.robot else {"robot"})
 
     def digest(self) -> str:
         """Return the hash of all fields."""
@@ -99,7 +109,7 @@ class RecordStore(Generic[RecordT]):
         """Read what is stored under a name.
 
         Raises:
-            OpenArmError: CONFIG_INVALID, when there is none or it is damaged, saying how.
+            OpenArmError: CONFIG_INVALID, when there is none, it is damaged, saying how, or of another robot.
         """
         path = self.path(name)
         if not path.is_file():
@@ -114,6 +124,7 @@ class RecordStore(Generic[RecordT]):
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the file is damaged and the history has no good one.
+            OfAnotherRobot: CONFIG_INVALID, when all that was stored is of another robot.
         """
         if not self.path(name).is_file() and not self._past(name):
             return None
@@ -124,10 +135,12 @@ class RecordStore(Generic[RecordT]):
             if not good:
                 raise
             older, record = good[-1]
+            if isinstance(error, OfAnotherRobot):  # two robots have stored in turn, which is no fault
+                return Found(record)
             return Found(record, f"{error.message}; the last good one, {older.name}, is used")
 
     def history(self, name: str) -> tuple[RecordT, ...]:
-        """Return all good records of a name, oldest first."""
+        """Return all good records of a name that are of this process's robot, oldest first."""
         return tuple(record for _, record in self._good(name))
 
     def rollback(self, name: str) -> RecordT:
@@ -145,7 +158,8 @@ class RecordStore(Generic[RecordT]):
         path, before = good[-2]
         write_whole(self.path(name), path.read_bytes())
         for later in past[past.index(path) + 1 :]:
-            later.unlink()
+            if not self._is_of_another(later):
+                later.unlink()
         return before
 
     def state(self) -> tuple[tuple[str, int, int], ...]:
@@ -163,7 +177,7 @@ class RecordStore(Generic[RecordT]):
         return self.folder / "history" / checked_name(name)
 
     def _good(self, name: str) -> list[tuple[Path, RecordT]]:
-        """Return the records of the history that are not damaged, oldest first."""
+        """Return the records of the history that are not damaged and of this robot, oldest first."""
         out: list[tuple[Path, RecordT]] = []
         for path in self._past(name):
             with contextlib.suppress(OpenArmError):
@@ -173,13 +187,21 @@ class RecordStore(Generic[RecordT]):
     def _past(self, name: str) -> list[Path]:
         return sorted(self._history(name).glob("*.yaml"), key=_number)
 
+    def _is_of_another(self, path: Path) -> bool:
+        try:
+            self._read(path)
+        except OpenArmError as error:
+            return isinstance(error, OfAnotherRobot)
+        return False
+
     def _read(self, path: Path) -> RecordT:
         """Read and check one file.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when it is not as it was written.
+            OfAnotherRobot: CONFIG_INVALID, when it is not of the robot of this process.
         """
-        data = load_yaml(path)
+        data = {"robot": "", **load_yaml(path)}
         stated = data.pop("sha256", None)
         record = validate(self._kind, data, str(path))
         if stated != record.digest():
@@ -188,6 +210,8 @@ class RecordStore(Generic[RecordT]):
                 f"{path} is damaged or was edited: its contents do not have the hash that it states; calibrate and save"
                 " again, or roll back",
             )
+        if text := other_robot(record.robot or DEFAULT):
+            raise OfAnotherRobot(Code.CONFIG_INVALID, f"{path} {text}")
         return record
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controllers of all arms and grippers: from goals and position commands to the actuator targets of a tick.
 
-Positions are rad (finger joints: m). Called by the thread that steps the world, but for `check_command`.
+Positions are rad (m of fingers that slide). Called by the thread that steps the world, but for `check_command`.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class RobotController(JointController):
         grippers: Joint group (one finger joint) of each gripper by side.
         joint_names: Order of the joints, of states and of targets.
         state: Where they are.
-        gripper_effort: Limit of each gripper, N, by side.
+        gripper_effort: Limit of each finger joint, N or N m, by side.
         trajectory: How arms follow.
         gripper: How grippers move.
         carriers: Make servo targets of the command of each arm, by side.
@@ -201,7 +201,7 @@ class RobotController(JointController):
             self.arms[side].carry_by(carrier)
 
     def effort_limits(self) -> Array:
-        """Return the effort limits (n,) of the joints, N; infinite but for those of the grippers."""
+        """Return the effort limits (n,) of the joints, N or N m; infinite but for those of the grippers."""
         limits = np.full(len(self.joint_names), np.inf)
         for follower, at in self._followers:
             if isinstance(follower, GripperFollower):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Moving one gripper, like parallel_gripper_action_controller.
 
-Position is that of the driving finger joint, m from the middle (0 closed, 0.044 open: half of the aperture); velocity
-m/s, effort N. The command ramps to the goal and stays there, so a gripper that is stopped by an object keeps
-pressing with the effort limit.
+Positions, velocities and efforts are those of the driving finger joint (m, N of a slide; rad, N m of a hinge); the
+configuration is of a finger, m from the middle, and the lever of the joint group lies between. The command ramps to the
+goal and stays there, so a gripper that is stopped by an object keeps pressing with the effort limit.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class GripperConfig(Config):
 
 @dataclass(frozen=True)
 class GripperOutcome:
-    """How a gripper goal ended, with the finger's position (m) and effort (N) then."""
+    """How a gripper goal ended, with position and effort of the finger joint then."""
 
     end: End
     position: float
@@ -54,12 +54,12 @@ class GripperOutcome:
 
 @dataclass(frozen=True)
 class GripperGoal:
-    """Goal of a finger.
+    """Goal of a finger joint.
 
     Args:
-        position: m.
-        max_effort: N; 0 or less is the limit of the gripper.
-        max_velocity: m/s; 0 or less is the configured one, which is never exceeded.
+        position: m, or rad.
+        max_effort: N, or N m; 0 or less is the limit of the gripper.
+        max_velocity: m/s, or rad/s; 0 or less is the configured one, which is never exceeded.
     """
 
     position: float
@@ -72,15 +72,16 @@ class GripperFollower(Follower):
 
     Args:
         group: The one driving finger joint.
-        config: Speeds and tolerances.
-        position: (1,) where the command starts, m.
-        max_effort: Limit of the gripper, N.
+        config: Speeds and tolerances of a finger.
+        position: (1,) where the command starts.
+        max_effort: Limit of the gripper.
     """
 
     def __init__(self, group: JointGroup, config: GripperConfig, position: ArrayLike, max_effort: float) -> None:
-        super().__init__(group, Tracker(position, [config.velocity], [config.acceleration]))
+        self._lever = abs(group.lever)
+        self._velocity = self._fastest = config.velocity / self._lever
+        super().__init__(group, Tracker(position, [self._velocity], [config.acceleration / self._lever]))
         self._config = config
-        self._velocity = config.velocity
         self._done: Callable[[GripperOutcome], None] | None = None
         self._cancelled = False
         self._still_ns = 0
@@ -88,7 +89,7 @@ class GripperFollower(Follower):
         self._max_effort = max_effort
         #: Whether the fingers are closed on something: they stay open further than commanded.
         self.pressing = False
-        #: Effort that the actuator may use, N.
+        #: Effort that the actuator may use.
         self.effort_limit = max_effort
 
     @property
@@ -109,8 +110,7 @@ class GripperFollower(Follower):
         if not lower - LIMIT_SLACK <= goal.position <= upper + LIMIT_SLACK:
             raise OpenArmError(
                 Code.LIMITS,
-                f"position of {name} is {goal.position:.4f} m, out of its limits {lower:.3f} (closed) to {upper:.3f}"
-                " (open)",
+                f"position of {name} is {goal.position:.4f}, out of its limits {lower:.3f} to {upper:.3f}",
             )
         return goal
 
@@ -142,8 +142,8 @@ class GripperFollower(Follower):
 
         Args:
             goal: From `check`.
-            position: Measured now, m.
-            effort: Measured now, N.
+            position: Measured now.
+            effort: Measured now.
             done: Called once, from `update` or `start`, when the goal ends.
         """
         self._finish(End.ABORTED, position, effort, "a newer goal took its place")
@@ -156,7 +156,7 @@ class GripperFollower(Follower):
 
     def update(self, t_ns: int, dt_ns: int, position: Array, velocity: Array, effort: Array) -> Array:
         """See `Follower.update`."""
-        self.pressing = float(position[0] - self._command.position[0]) > _PRESSING
+        self.pressing = float(position[0] - self._command.position[0]) * self.group.lever > _PRESSING
         if self._done is not None:
             self._judge(t_ns, dt_ns, float(position[0]), float(velocity[0]), float(effort[0]))
         if self._command.position[0] != self._target[0]:
@@ -169,13 +169,13 @@ class GripperFollower(Follower):
             self._target = self._command.position.copy()
             self._finish(End.CANCELLED, position, effort, "cancelled; the gripper holds")
             return
-        still = abs(velocity) <= config.stall_velocity
+        still = abs(velocity) * self._lever <= config.stall_velocity
         self._still_ns = self._still_ns + dt_ns if still else 0
         if self._command.position[0] != self._target[0]:
             return
         if self._arrived_ns is None:
             self._arrived_ns = t_ns
-        if still and abs(position - self._target[0]) <= config.goal_tolerance:
+        if still and abs(position - self._target[0]) * self._lever <= config.goal_tolerance:
             self._finish(End.SUCCEEDED, position, effort, "goal reached", reached=True)
         elif self._still_ns >= config.stall_time * 1e9:
             self._finish(End.SUCCEEDED, position, effort, "stalled", stalled=True)
@@ -184,13 +184,13 @@ class GripperFollower(Follower):
                 End.ABORTED,
                 position,
                 effort,
-                f"{self.group.names[0]} still moves at {velocity:.4f} m/s, {config.timeout:g} s after its command"
-                f" arrived at {self._target[0]:.4f} m",
+                f"{self.group.names[0]} still moves at {velocity:.4f}/s, {config.timeout:g} s after its"
+                f" command arrived at {self._target[0]:.4f}",
             )
 
     def _aim(self, position: float, velocity: float, effort: float) -> None:
         self._target = self._within_limits(np.array([position]))
-        self._velocity = velocity if velocity > 0.0 else self._config.velocity
+        self._velocity = velocity if velocity > 0.0 else self._fastest
         self.effort_limit = min(effort, self._max_effort) if effort > 0.0 else self._max_effort
 
     def _finish(

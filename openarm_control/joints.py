@@ -23,7 +23,7 @@ _DELAY_S = 0.015
 
 @dataclass(frozen=True)
 class JointReadout:
-    """State of the controlled joints at `t_ns`, arrays (n,): rad, rad/s, N m; of fingers m, m/s, N."""
+    """State of the controlled joints at `t_ns`, arrays (n,): rad, rad/s, N m; of a finger that slides m, m/s, N."""
 
     t_ns: int
     position: Array
@@ -43,7 +43,7 @@ def arm_groups(description: RobotDescription) -> dict[str, JointGroup]:
 
 def gripper_groups(description: RobotDescription) -> dict[str, JointGroup]:
     """Return the joint group (the driving finger joint) of each gripper, by arm."""
-    return {name: _group(description, (arm.finger_joint,)) for name, arm in description.arms.items()}
+    return {name: _group(description, (hand.joint,), lever=hand.lever) for name, hand in description.hands.items()}
 
 
 def arm_loads(description: RobotDescription) -> dict[str, ArmLoad]:
@@ -75,7 +75,9 @@ def carriers(
     return found
 
 
-def _group(description: RobotDescription, names: Sequence[str]) -> JointGroup:
+def _group(description: RobotDescription, names: Sequence[str], lever: float = 1.0) -> JointGroup:
     lower, upper = description.limits(names)
     speeds = np.array([description.joint(name).velocity for name in names])
-    return JointGroup(tuple(names), lower, upper, speeds)  # those of the motors, far above what a plan should use
+    return JointGroup(
+        tuple(names), lower, upper, speeds, lever
+    )  # those of the motors, far above what a plan should use

@@ -21,7 +21,7 @@ from openarm_control.loop import ControlLoop
 from openarm_control.pacing import Pacer, PeriodMeter
 
 PERIOD_NS = 10_000_000
-#: Joint states that are further apart than this, rad (m), and what joints may move meanwhile, rad/s (m/s), are of a
+#: Joint states that are further apart than this, rad (fingers: m), and what these move meanwhile, rad/s (m/s), are of a
 #: robot that was put elsewhere, or of an encoder that jumped.
 _JUMP_ARM, _SPEED_ARM = 0.05, 6.0
 _JUMP_FINGER, _SPEED_FINGER = 0.005, 0.5
@@ -92,7 +92,8 @@ class StreamedRobot(ControlLoop):
             [controller.joint_names.index(gripper.group.names[0]) for gripper in controller.grippers.values()]
         )
         self._jump, self._speed = (np.full(len(controller.joint_names), x) for x in (_JUMP_ARM, _SPEED_ARM))
-        self._jump[self._fingers], self._speed[self._fingers] = _JUMP_FINGER, _SPEED_FINGER
+        levers = np.abs([gripper.group.lever for gripper in controller.grippers.values()])
+        self._jump[self._fingers], self._speed[self._fingers] = _JUMP_FINGER / levers, _SPEED_FINGER / levers
         self._finger_at: Array = np.zeros(len(self._fingers))
         self._finger_velocity: Array = np.zeros(len(self._fingers))
         self._finger_ns = 0

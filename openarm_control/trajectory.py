@@ -52,12 +52,18 @@ class TrajectoryError(OpenArmError):
 
 @dataclass(frozen=True, eq=False)
 class JointGroup:
-    """The joints of one controller; arrays (k,), rad or m, rad/s or m/s."""
+    """The joints of one controller; arrays (k,), rad or m, rad/s or m/s.
+
+    Attributes:
+        lever: Of the joint of a gripper: what a finger moves when it does, m/m or m/rad; negative where it opens
+            downwards.
+    """
 
     names: tuple[str, ...]
     lower: Array
     upper: Array
     max_velocity: Array
+    lever: float = 1.0
 
 
 def limits_of(*groups: JointGroup) -> dict[str, tuple[float, float]]:

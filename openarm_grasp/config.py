@@ -3,21 +3,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from openarm_common.config import Config
-
-
-def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
-    if not ends[0] < ends[1]:
-        raise ValueError(f"{list(ends)} must ascend")
-    return ends
-
-
-#: Two ends, the lower first.
-Interval = Annotated[tuple[float, float], AfterValidator(_ascending)]
+from openarm_common.camera.cameras import table_camera
+from openarm_common.config import Config, Interval
+from openarm_common.robot.folder import robot_hand, robot_work
 
 
 class ApproachConfig(Config):
@@ -36,7 +28,12 @@ class ApproachConfig(Config):
     round_step_deg: float = Field(
         default=30.0, gt=0.0, le=90.0, description="turns of the hand around what is round that are tried, deg"
     )
-    max_width: float = Field(default=0.070, gt=0.0, le=0.080, description="widest object side that is grasped, m")
+    max_width: float = Field(
+        default_factory=lambda: robot_hand().max_width,
+        gt=0.0,
+        le=0.2,
+        description="widest object side that is grasped, m",
+    )
     width_noise: float = Field(
         default=0.002, ge=0.0, le=0.005, description="error of a measured width allowed beyond it, m"
     )
@@ -62,9 +59,8 @@ class ApproachConfig(Config):
 
 
 class HandConfig(Config):
-    """The gripper's own measures, behind the tool centre point (TCP)."""
+    """How hands open and close."""
 
-    opening: float = Field(default=0.044, gt=0.0, le=0.1, description="position of one finger when open, m")
     close_effort: float = Field(
         default=0.0,
         ge=0.0,
@@ -72,17 +68,8 @@ class HandConfig(Config):
         description="largest closing force, N; 0: the driver's limit. Spares what is soft",
     )
     open_tolerance: float = Field(
-        default=0.004, gt=0.0, le=0.01, description="a finger this near to `opening` is open, m"
+        default=0.004, gt=0.0, le=0.01, description="a finger this near to where it is open is there, m"
     )
-    tip_clearance: float = Field(
-        default=0.012, ge=0.0, le=0.03, description="TCP above the table so that the tips clear it, m"
-    )
-    tip_clearance_tilted: float = Field(default=0.018, ge=0.0, le=0.05, description="added times sin(tilt), m")
-    pad_centre: float = Field(default=0.017, ge=0.0, le=0.05, description="middle of the finger pads behind the TCP, m")
-    palm_depth: float = Field(
-        default=0.045, ge=0.0, le=0.1, description="deepest an object may reach between the fingers, m"
-    )
-    palm_depth_tilted: float = Field(default=0.030, ge=0.0, le=0.1, description="taken off times sin(tilt), m")
 
 
 class TimingConfig(Config):
@@ -146,11 +133,10 @@ class DetectConfig(Config):
 
 
 class NearLookConfig(Config):
-    """A second observation from the pre-grasp, by a camera mounted on the hand; skipped without its detector."""
+    """A second observation from the pre-grasp, by a camera on the hand; skipped without it or its detector."""
 
     enabled: bool = Field(default=True, description="whether the camera on the hand is asked before the grasp")
-    camera: str = Field(default="wrist", description="that is mounted on the hand")
-    topic: str = Field(default="/wrist/detections_3d", description="what its detector finds")
+    topic: str = Field(default="/{camera}/detections_3d", description="what the detector of {camera} finds")
     frames: int = Field(default=2, ge=1, le=10, description="that are averaged")
     least: float = Field(default=0.001, ge=0.0, le=0.01, description="smaller corrections are not made, m")
     largest: float = Field(default=0.03, gt=0.0, le=0.1, description="what is seen farther off is another object, m")
@@ -179,8 +165,12 @@ class PlaceConfig(Config):
         default=0.02, gt=0.0, le=0.1, description="seen this near to the target counts as placed, m"
     )
     yaw_step_deg: float = Field(default=30.0, gt=0.0, le=180.0, description="turns of the object that are tried, deg")
-    region_x: Interval = Field(default=(0.16, 0.36), description="x of free spots, base frame, m")
-    region_abs_y: Interval = Field(default=(0.06, 0.42), description="|y| of free spots on the arm's side, m")
+    region_x: Interval = Field(
+        default_factory=lambda: robot_work().region.x, description="x of free spots, base frame, m"
+    )
+    region_abs_y: Interval = Field(
+        default_factory=lambda: robot_work().region.abs_y, description="|y| of free spots on the arm's side, m"
+    )
     spot_step: float = Field(default=0.04, gt=0.0, le=0.2, description="grid of free spots, m")
     spots: int = Field(default=6, ge=1, le=50, description="free spots that are offered to the planner")
     neighbour_distance: float = Field(default=0.10, ge=0.0, le=0.5, description="least distance to other objects, m")
@@ -195,8 +185,10 @@ class PlaceConfig(Config):
 class HandOverConfig(Config):
     """Where objects change hands: on the table, on a strip in the middle that both arms reach."""
 
-    x: Interval = Field(default=(0.20, 0.32), description="ends of the strip, base frame, m")
-    abs_y: float = Field(default=0.03, gt=0.0, le=0.2, description="half of its width, m")
+    x: Interval = Field(default_factory=lambda: robot_work().strip.x, description="ends of the strip, base frame, m")
+    abs_y: float = Field(
+        default_factory=lambda: robot_work().strip.abs_y, gt=0.0, le=0.2, description="half of its width, m"
+    )
     step: float = Field(default=0.03, gt=0.0, le=0.2, description="grid of spots, m")
     tries: int = Field(default=9, ge=1, le=50, description="spots and turns that the other arm is asked about")
     margin: float = Field(
@@ -290,7 +282,9 @@ class GraspConfig(Config):
         default="home", description="SRDF group state of both arms that keeps the camera's view free"
     )
     home_tolerance: float = Field(default=0.05, gt=0.0, le=0.5, description="joints this near to home are home, rad")
-    camera: str = Field(default="overhead", description="that the detections come from; named by the drift alarm")
+    camera: str = Field(
+        default_factory=table_camera, description="that the detections come from; named by the drift alarm"
+    )
     velocity_scale: float = Field(
         default=0.0, ge=0.0, le=1.0, description="of the motion limits; 0 = the planner's default"
     )
@@ -299,10 +293,10 @@ class GraspConfig(Config):
     timing: TimingConfig = TimingConfig()
     held: HeldConfig = HeldConfig()
     detect: DetectConfig = DetectConfig()
-    near: NearLookConfig = NearLookConfig()
+    near: NearLookConfig = Field(default_factory=NearLookConfig)
     confirm: ConfirmConfig = ConfirmConfig()
-    place: PlaceConfig = PlaceConfig()
-    hand_over: HandOverConfig = HandOverConfig()
+    place: PlaceConfig = Field(default_factory=PlaceConfig)
+    hand_over: HandOverConfig = Field(default_factory=HandOverConfig)
     push: PushConfig = PushConfig()
     limits: LimitsConfig = LimitsConfig()
     budget: BudgetConfig = BudgetConfig()

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.cameras import hand_cameras, load_cameras
 from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.scene import Table
+from openarm_common.robot.hand import HandParts
+from openarm_common.robot.work import Table
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.arms import Shoulders, arm_order
 
@@ -19,21 +21,29 @@ class GraspContext:
     Attributes:
         config: Parameters.
         table: Where objects stand.
+        hand: Measures of the grippers.
         shoulders: (x, y) of each arm's shoulder, base frame, m.
-        looks: The arm whose hand carries the camera of the second look; "": none.
+        looks: Camera of the second look, by the arm whose hand carries it.
     """
 
     config: GraspConfig
     table: Table
+    hand: HandParts
     shoulders: Shoulders
-    looks: str = ""
+    looks: Mapping[str, str] = field(default_factory=dict[str, str])
 
     @classmethod
     def of(cls, config: GraspConfig, table: Table, robot: RobotDescription) -> GraspContext:
         """That of a robot at a table."""
-        camera = load_cameras().get(config.near.camera)
-        looks = robot.arm_of(camera.parent) if camera is not None and config.near.enabled else ""
-        return cls(config, table, {arm: _shoulder(robot, arm) for arm in robot.arm_names}, looks)
+        cameras = load_cameras()
+        looks = {robot.arm_of(cameras[name].parent): name for name in hand_cameras()} if config.near.enabled else {}
+        return cls(
+            config,
+            table,
+            robot.hand(robot.arm_names[0]).parts,
+            {arm: _shoulder(robot, arm) for arm in robot.arm_names},
+            looks,
+        )
 
     def arm_order(self, arm: str, y: float) -> tuple[str, ...]:
         """Arms to try for an object; see `openarm_grasp.planning.arms.arm_order`."""

@@ -74,9 +74,6 @@ class PlanningConfig(Config):
     )
     keep: int = Field(default=4, ge=1, le=64, description="configurations kept a target")
     period: float = Field(default=0.02, ge=0.002, le=0.2, description="greatest time between trajectory samples, s")
-    gripper_open: float = Field(
-        default=0.044, ge=0.0, description="position of the finger joints of an open gripper, m"
-    )
 
 
 class ExecutionConfig(Config):

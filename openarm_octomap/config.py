@@ -7,6 +7,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from openarm_common.camera.cameras import depth_cameras
 from openarm_common.camera.flying_pixels import FlyingConfig
 from openarm_common.config import Config
 from openarm_common.robot.self_filter import SelfFilterConfig
@@ -93,7 +94,9 @@ class FieldConfig(Config):
 class OctomapNodeConfig(Config):
     """Parameters of the node `octomap`."""
 
-    cameras: tuple[str, ...] = Field(default=("overhead", "wrist"), description="cameras of cameras.yaml")
+    cameras: tuple[str, ...] = Field(
+        default_factory=lambda: tuple(depth_cameras()), description="cameras of cameras.yaml"
+    )
     depth_topic: str = Field(default="/{camera}/depth/image_raw", description="depth image; {camera} is filled in")
     info_topic: str = Field(default="/{camera}/depth/camera_info", description="CameraInfo; {camera} is filled in")
     cloud_topic: str = Field(default="cloud_in", description="clouds, a second input; empty: none")

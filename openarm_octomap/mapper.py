@@ -120,7 +120,7 @@ class Mapper:
     def __init__(
         self, description: RobotDescription, grid: GridConfig, robot: FilterConfig, distances: FieldConfig
     ) -> None:
-        self._grid = OccupancyGrid(grid)
+        self._grid, self._robot = OccupancyGrid(grid), description.name
         self._filter = SelfFilter(description, robot)
         self._filtering = robot.enabled
         self._reset_padding = robot.reset_padding
@@ -254,7 +254,7 @@ class Mapper:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{str(path)!r} needs the suffix .bt or .ot")
         with self._lock:
             payload = self._grid.full() if path.suffix == ".ot" else self._grid.binary()
-        write_file(path, payload, self._grid.lattice.resolution)
+        write_file(path, payload, self._grid.lattice.resolution, self._robot)
         return payload.nodes
 
     def query(self, points: ArrayLike, resolution: float, unknown: UnknownPolicy) -> Answer:
@@ -292,9 +292,13 @@ class Mapper:
             Nodes of its tree, and how many of its leaves lie outside of the workspace.
 
         Raises:
-            OpenArmError: INVALID_ARGUMENT, when the file is damaged or has cells of another size; the map is as it was.
+            OpenArmError: INVALID_ARGUMENT, when the file is damaged, has cells of another size, or says that it is of
+                another robot, whose base frame is elsewhere; the map is as it was.
         """
         leaves = read_file(path)
+        if leaves.robot not in ("", self._robot):
+            text = f"{path} is of robot {leaves.robot[:80]!r}, expected {self._robot!r}"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}: its cells are in another base frame")
         with self._lock:
             self._edition += 1
             try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
+from openarm_common.camera.cameras import depth_cameras, table_camera
 from openarm_common.config import Config, RunTimeField
 from openarm_common.scene.scene import load_scene
 from openarm_perception.detection.detector import Policy
@@ -21,7 +22,9 @@ from openarm_perception.geometry.watch import WatchConfig
 class DetectNodeConfig(Config):
     """Parameters of the node `detector`."""
 
-    camera: str = Field(default="overhead", description="camera of cameras.yaml; gives frame and depth limits")
+    camera: str = Field(
+        default_factory=table_camera, description="camera of cameras.yaml; gives frame and depth limits"
+    )
     color_topic: str = Field(default="/{camera}/color/image_raw", description="colour image; {camera} is filled in")
     depth_topic: str = Field(
         default="/{camera}/depth/image_raw",
@@ -74,7 +77,9 @@ class DetectNodeConfig(Config):
 class CloudNodeConfig(Config):
     """Parameters of the node `cloud`."""
 
-    cameras: tuple[str, ...] = Field(default=("overhead", "wrist"), min_length=1, description="cameras of cameras.yaml")
+    cameras: tuple[str, ...] = Field(
+        default_factory=lambda: tuple(depth_cameras()), min_length=1, description="cameras of cameras.yaml"
+    )
     depth_topic: str = Field(default="/{camera}/depth/image_raw", description="depth image; {camera} is filled in")
     info_topic: str = Field(default="/{camera}/depth/camera_info", description="CameraInfo; {camera} is filled in")
     points_topic: str = Field(default="/{camera}/depth/points", description="the cloud; {camera} is filled in")

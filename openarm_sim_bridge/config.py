@@ -39,7 +39,7 @@ class BridgeConfig(Config):
     calibrations: str = Field(
         default="", description="folder of calibrations, which holds identified servos; empty: the default one"
     )
-    cameras: str = Field(default="", description="path of a cameras YAML; empty: that of the suite")
+    cameras: str = Field(default="", description="path of a cameras YAML; empty: that of the robot's folder")
     depth_encoding: Literal["16UC1", "32FC1"] = Field(default="16UC1", description="whole millimetres, or metres")
     images: bool = Field(default=True, description="whether there are cameras; false saves their process")
     speed: float = Field(

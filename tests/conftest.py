@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
@@ -17,8 +18,11 @@ from typing import IO
 
 import hypothesis
 import pytest
+import yaml
 
 from openarm_common.domain import release_domain, reserve_domain
+from openarm_common.resources import models_dir
+from openarm_common.robot import folder
 
 # Before any rclpy is imported: a domain of this process, no traffic beyond this machine, software rendering.
 os.environ["ROS_DOMAIN_ID"] = str(reserve_domain())
@@ -174,3 +178,19 @@ def ros() -> Iterator[RosProbe]:
         yield probe
     finally:
         probe.close()
+
+
+@pytest.fixture
+def nearer(tmp_path, monkeypatch) -> str:
+    """Let the process's robot be one like OpenArm v1 with a higher table and a nearer region; its name."""
+    robots = tmp_path / "models" / "robots"
+    for name in ("openarm_v1", "nearer"):
+        shutil.copytree(models_dir() / "robots" / "openarm_v1", robots / name)
+    path = robots / "nearer" / "robot.yaml"
+    data = yaml.safe_load(path.read_text())
+    data["work"]["table"]["top_z"] = 0.45
+    data["work"]["region"] = {"x": [0.15, 0.35], "abs_y": [0.05, 0.45]}
+    path.write_text(yaml.safe_dump(data))
+    monkeypatch.setattr(folder, "models_dir", lambda: robots.parent)
+    monkeypatch.setenv(folder.ROBOT, "nearer")
+    return "nearer"

@@ -14,7 +14,7 @@ import pytest
 from openarm_bringup.supervision.graph import load_graph
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import config_dir
+from openarm_common.resources import models_dir
 from openarm_grasp.strategies import registry
 from openarm_motion.planning.planner import PlanQuery, make_planner
 from tests.openarm_grasp.scripted import Wait, World, standing
@@ -50,7 +50,7 @@ def test_each_recipe_touches_at_most_three_files_that_there_are() -> None:
 
 def test_the_camera_is_read_and_its_graph_is_valid(tmp_path: Path) -> None:
     cameras = tmp_path / "cameras.yaml"
-    known = (config_dir() / "params" / "cameras.yaml").read_text(encoding="utf-8")
+    known = (models_dir() / "robots" / "openarm_v1" / "cameras.yaml").read_text(encoding="utf-8")
     cameras.write_text(known + textwrap.indent(example("A camera", "yaml"), "  "))
     side = load_cameras(cameras)["side"]
     assert side.optical_frame == "side_color_optical_frame"
@@ -58,7 +58,6 @@ def test_the_camera_is_read_and_its_graph_is_valid(tmp_path: Path) -> None:
     graph.write_text(example("A camera", "yaml", 1))
     loaded = load_graph(str(graph))
     assert loaded.nodes["side_detector"].params["camera"] == side.name
-    assert side.name in loaded.nodes["octomap"].params["cameras"]
 
 
 def test_the_detector_finds_what_is_colourful() -> None:

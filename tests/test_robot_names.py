@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No name of a robot's arms, links, joints or frames is in code outside its folder."""
+"""No name of a robot's arms, links, joints, frames or cameras is in code outside its folder."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.folder import robot_names
+from openarm_common.robot.folder import ROBOT, robot_names
 
 ROOT = Path(__file__).parents[1]
 #: Texts that are words of a language or of another library as well, by file.
@@ -56,9 +57,10 @@ def test_the_search_finds_names(tmp_path):
 
 @pytest.mark.requirement("R-07", "B-13")
 @pytest.mark.parametrize("robot", robot_names())
-def test_no_name_of_a_robot_is_in_code(robot):
+def test_no_name_of_a_robot_is_in_code(robot, monkeypatch):
+    monkeypatch.setenv(ROBOT, robot)
     description = RobotDescription.load(robot)
-    names = {*description.links, *description.joints, *description.arms} - {description.root}
+    names = {*description.links, *description.joints, *description.arms, *load_cameras()} - {description.root}
     long = {name for name in names if "_" in name}
     hits = []
     for path in sorted(ROOT.glob("openarm_*/**/*.py")):

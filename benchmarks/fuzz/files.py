@@ -177,6 +177,8 @@ def _yaml(folder: Path) -> list[Reader]:
     from openarm_perception.detection.detector import ColorDetectorConfig
     from openarm_sim_bridge.faults.faults import FAULTS, parse_fault
 
+    robot = models_dir() / "robots/openarm_v1"
+
     def of(*folders: Path) -> tuple[bytes, ...]:
         return tuple(path.read_bytes() for folder in folders for path in sorted(folder.glob("*.yaml")))
 
@@ -203,15 +205,15 @@ def _yaml(folder: Path) -> list[Reader]:
     params = b"/**:\n  ros__parameters: {a: 1, b: {c: [1, 2]}}\nnode:\n  ros__parameters: {d: text}\n"
     bins = b"bins: {left: [0.3, 0.2], right: [0.3, -0.2]}\nclasses: {red: left}\nrest: right\n"
     return [
-        Reader("scene.yaml", of(models_dir() / "scenes"), altered_yaml, load_scene),
+        Reader("scene.yaml", of(models_dir() / "scenes", robot / "scenes"), altered_yaml, load_scene),
         Reader("graph.yaml", of(config_dir() / "graphs"), altered_yaml, lambda path: load_graph(str(path))),
         Reader("params.yaml", (params,), altered_yaml, lambda path: read_params(path, "node")),
-        Reader("cameras.yaml", ((config_dir() / "params/cameras.yaml").read_bytes(),), altered_yaml, load_cameras),
+        Reader("cameras.yaml", ((robot / "cameras.yaml").read_bytes(),), altered_yaml, load_cameras),
         Reader(
             "detector.yaml", ((config_dir() / "params/detector.yaml").read_bytes(),), altered_yaml,
             lambda path: load_config(path, ColorDetectorConfig),
         ),
-        Reader("store/wrist.yaml", of(config_dir() / "calibration/mount_seed_1"), altered_yaml, stored),
+        Reader("store/wrist.yaml", of(robot / "calibration/mount_seed_1"), altered_yaml, stored),
         Reader("tables/table/table.yaml", ((folder / "table/table.yaml").read_bytes(),), altered_yaml, measured),
         Reader("bins.yaml", (bins,), altered_yaml, load_bins),
         Reader(
@@ -315,8 +317,6 @@ def _onnx(folder: Path) -> list[Reader]:
 
 
 def _robots(folder: Path) -> list[Reader]:
-    from openarm_motion.collision.robot_meshes import load_robot
-
     robot = RobotDescription.load()
     mesh = (
         b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
@@ -337,10 +337,10 @@ def _robots(folder: Path) -> list[Reader]:
     def meshed(path: Path) -> object:
         urdf = path.with_suffix(".urdf")
         urdf.write_text(small.replace("FILE", path.name))
-        return load_robot(urdf)
+        return RobotDescription.from_files(urdf)
 
     def described(path: Path) -> None:
-        one = load_robot(path)
+        one = RobotDescription.from_files(path)
         one.link_poses(dict.fromkeys(one.joints, 0.1))
 
     (folder / "robot").mkdir()

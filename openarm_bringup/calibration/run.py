@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from openarm_bringup.supervision import runs
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
-from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.cameras import uncertain_cameras
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 
 if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
@@ -42,7 +43,7 @@ class CalibrationOptions:
         sets: Parameters, as node.param=value.
     """
 
-    cameras: tuple[str, ...] = ("overhead", "wrist")
+    cameras: tuple[str, ...] = field(default_factory=uncertain_cameras)
     mount_seed: int | Literal["none"] | None = None
     poses: int = 0
     enough: tuple[float, float] = (0.0, 0.0)
@@ -89,7 +90,7 @@ def chosen_cameras(names: Sequence[str]) -> tuple[str, ...]:
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing those that can be calibrated.
     """
-    can = [camera.name for camera in load_cameras().values() if camera.mount_error]
+    can = uncertain_cameras()
     for name in names:
         if name not in can:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no camera {name!r} to calibrate; cameras: {', '.join(can)}")
@@ -118,11 +119,12 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
         from openarm_bringup.ros.simulation import reset_world
         from openarm_calibration.ros.client import CalibrationClient
 
+        # fingers that are open hide less from a camera behind them
+        opened = {hand.joint: hand.opened for hand in RobotDescription.load().hands.values()}
         with CalibrationClient() as client:
-            for k, camera in enumerate(cameras):
+            for camera in cameras:
                 listeners.on_camera(camera)
-                if k:
-                    reset_world(client, scene_of(camera))
+                reset_world(client, scene_of(camera), joints=opened)
                 session = str((run.run_dir / f"{camera}.npz").absolute())
                 run.results[camera] = client.auto(
                     camera, **options.goal, session=session, on_feedback=listeners.on_feedback, stop=stop

@@ -120,6 +120,7 @@ def _from_session(path: Path, source: Source) -> tuple[SampleSet, str]:
 
 
 def _from_bag(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str, Any]], str]:
+    from openarm_bringup.bags.about import require_robot
     from openarm_bringup.bags.bag import open_bag
     from openarm_bringup.calibration.ros.samples import samples_of
     from openarm_calibration.sampling import stills
@@ -131,6 +132,7 @@ def _from_bag(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--mount-seed {source.mount_seed}: expected 0 or more")
     board = _board(source.board)
     with open_bag(path) as bag:
+        require_robot(bag)
         samples, found = samples_of(bag, source.camera, board, source.carrier, source.mount_seed)
     digest = samples.save(session) if session is not None else samples.digest()
     return samples, digest, stills.rows(found), stills.summary(found)

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from openarm_bringup.calibration.source import store_in
-from openarm_bringup.commands.connect import Domain, Sets, join_graph, requires_node
+from openarm_bringup.commands.connect import Domain, Robot, Sets, join_graph, requires_node
 from openarm_bringup.outcome import GraphReport, Outcome
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import choose_robot
 
 if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
@@ -27,7 +28,7 @@ LEAST_POSTURES = 2
 
 def auto(
     *,
-    camera: str = "both",
+    camera: str = "all",
     mount_seed: str | None = None,
     poses: int = 0,
     save: bool = False,
@@ -36,6 +37,7 @@ def auto(
     running: bool = False,
     domain: Domain = None,
     set_: Sets = (),
+    robot: Robot = None,
 ) -> Outcome:
     """Calibrate automatically: the arm moves from one informative pose to the next, takes samples, and solves.
 
@@ -43,7 +45,7 @@ def auto(
     samples and a page with pictures for each camera. Ctrl-C stops the arm.
 
     Args:
-        camera: Name of a camera (overhead, wrist), or "both", one after the other.
+        camera: Name of a camera, or "all" whose mounts are uncertain, one after the other.
         mount_seed: Of the simulated mounts, or "none"; that of the graph `calibrate` when not given.
         poses: Samples a camera at most; 0: the node's parameter auto.poses.
         save: Store the result, unless it fails the limits.
@@ -52,7 +54,9 @@ def auto(
         running: Use the graph that runs, with the board in place, instead of a simulated one.
         domain: ROS_DOMAIN_ID; a free one, or that of the running graph, when not given.
     """
+    choose_robot(robot)
     from openarm_bringup.calibration.run import CalibrationListeners, CalibrationOptions, run_calibration
+    from openarm_common.camera.cameras import uncertain_cameras
 
     if poses and not 4 <= poses <= MOST_POSES:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--poses {poses}: expected 4 to {MOST_POSES}; 10 to 15 are usual")
@@ -65,7 +69,7 @@ def auto(
         store_in(store)
     show = _Show()
     options = CalibrationOptions(
-        ("overhead", "wrist") if camera == "both" else (camera,),
+        uncertain_cameras() if camera == "all" else (camera,),
         mount_seed=seed, poses=poses, save=save, store=store, delay=delay, domain=domain, sets=tuple(set_),
     )  # fmt: skip
     if running:
@@ -107,7 +111,7 @@ def sample(*, remove: str | None = None, session: str = "", advice: bool = False
 
 def table(
     *,
-    camera: str = "overhead",
+    camera: str = "",
     block_height: float = 0.0,
     label: str = "",
     dry_run: bool = False,
@@ -116,17 +120,19 @@ def table(
     """Measure the height of the table in the running graph and store it; every node takes it over at once.
 
     Args:
-        camera: Whose depth is used: overhead or wrist.
+        camera: Whose depth is used; that of the camera over the table when not given.
         block_height: Of a block that stands on the table, m, whose top is measured instead of the table's surface.
         label: Of that block, when several objects are in view.
         dry_run: Measure, and store nothing.
     """
     join_graph(domain)
-    from openarm_calibration.ros.client import DETECTORS, CalibrationClient
+    from openarm_calibration.ros.client import CalibrationClient
+    from openarm_common.camera.cameras import detector_nodes, table_camera
 
-    if camera not in DETECTORS:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"--camera {camera}: unknown; cameras: {', '.join(DETECTORS)}")
-    with requires_node(DETECTORS[camera], "sim"), CalibrationClient() as client:
+    detectors, camera = detector_nodes(), camera or table_camera()
+    if camera not in detectors:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--camera {camera}: unknown; cameras: {', '.join(detectors)}")
+    with requires_node(detectors[camera], "sim"), CalibrationClient() as client:
         measured = client.measure_table(camera, block_height, label)
         data: dict[str, Any] = {name: getattr(measured, name) for name in ("height", "std", "tilt", "points")}
         if not measured.success:
@@ -148,7 +154,7 @@ def dynamics(*, arm: str = "both", postures: int = 6, dry_run: bool = False, dom
     carries the arms by what is stored from then on.
 
     Args:
-        arm: left, right or both.
+        arm: Which, or both.
         postures: In which it moves; more are slower and more exact.
         dry_run: Identify, and store nothing.
     """

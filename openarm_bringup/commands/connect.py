@@ -14,21 +14,16 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import ROBOT, known_arm
 
 if TYPE_CHECKING:
     from openarm_bringup.ros.peer import Peer
 
 
-def _known_arms(_: object, value: str | list[str] | None) -> None:
-    from openarm_common.robot.folder import known_arm
-
-    for arm in [value] if isinstance(value, str) else value or ():
-        known_arm(arm)
-
-
-#: An arm of the robot, or auto.
-Arm = Annotated[str, Parameter(validator=_known_arms)]
-Arms = Annotated[list[str] | None, Parameter(validator=_known_arms)]
+Robot = Annotated[
+    str | None,
+    Parameter(help="Name of a folder of models/robots; that of OPENARM_ROBOT, or openarm_v1, when not given."),
+]
 
 Domain = Annotated[
     int | None,
@@ -46,6 +41,8 @@ PEER: ContextVar[Callable[[], Peer] | None] = ContextVar("PEER", default=None)
 
 def join_graph(domain: int | None) -> None:
     """Set the environment of this process so that it meets the graph: that of a domain, or the only one running here.
+
+    The robot of this process is that of the graph then.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for no number of a domain, or when several graphs run.
@@ -66,9 +63,22 @@ def join_graph(domain: int | None) -> None:
             os.environ["ROS_DOMAIN_ID"] = str(domain)
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         return
-    os.environ.update(discovery.variables(record.domain, record.discovery))
+    os.environ.update({**discovery.variables(record.domain, record.discovery), ROBOT: record.robot})
     if record.discovery in discovery.ACROSS_MACHINES:
         os.environ.setdefault(discovery.PROFILE, str(discovery.network_profile()))
+
+
+def check_arms(*arms: str) -> None:
+    """Refuse arms that the robot of this process does not have; "auto" and "" are left to the suite.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, listing the arms.
+    """
+    for arm in arms:
+        try:
+            known_arm(arm)
+        except ValueError as error:
+            raise OpenArmError(Code.INVALID_ARGUMENT, str(error)) from error
 
 
 def graph_peer(domain: int | None) -> Peer:

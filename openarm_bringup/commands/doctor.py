@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from openarm_bringup.doctor import checks, graph
 from openarm_bringup.doctor.checks import Finding
 from openarm_bringup.outcome import Outcome, as_text
-from openarm_common.errors import Code
+from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
     from openarm_bringup.supervision.runs import RunRecord
@@ -91,6 +91,7 @@ def gather(graph: str) -> list[Finding]:
         findings += [checks.check_imports(failed[purpose], purpose, names) for purpose, names in GROUPS.items()]
         findings.append(checks.check_gl(render.result(), environ.get("MUJOCO_GL", "egl")))
         findings += of_graph.result()
+        findings.append(_robot())
         domain = environ.get("ROS_DOMAIN_ID", "") or "0"
         findings.append(checks.check_domain(domain, _first_ephemeral_port()))
         if findings[-1].level != "error":
@@ -206,6 +207,21 @@ def _can_share(port: int) -> bool:
                 raise
             return False
     return True
+
+
+def _robot() -> Finding:
+    """What the robot of the graph that runs, or else of this process, is called, and whether its folder can be read."""
+    from openarm_common.camera.cameras import load_cameras
+    from openarm_common.robot.folder import load_folder, robot_name
+
+    try:
+        _, robot = load_folder(robot_name())
+        cameras = ", ".join(load_cameras()) or "none"
+    except OpenArmError as error:
+        return checks.error(
+            "robot", error.message, "mend its folder in models/robots, or name another by OPENARM_ROBOT"
+        )
+    return checks.ok("robot", f"{robot_name()}: arms {', '.join(robot.arms)}; cameras {cameras}")
 
 
 def _machine() -> Finding:

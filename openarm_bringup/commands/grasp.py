@@ -7,7 +7,7 @@ from typing import Literal
 
 from cyclopts import App
 
-from openarm_bringup.commands.connect import Arm, Domain, join_graph, requires_node
+from openarm_bringup.commands.connect import Domain, check_arms, join_graph, requires_node
 from openarm_bringup.outcome import Outcome
 
 grasp = App(name="grasp", help="The states of a grasp; release of a hand.")
@@ -28,13 +28,14 @@ def graph(*, form: Literal["text", "mermaid"] = "text") -> Outcome:
 
 
 @grasp.command
-def release(*, arm: Arm = "", domain: Domain = None) -> Outcome:
+def release(*, arm: str = "", domain: Domain = None) -> Outcome:
     """Open a hand where it is: what it holds falls from there. `openarm pick --phase place` puts it down instead.
 
     Args:
-        arm: left or right; when not given, of the one that holds something.
+        arm: Which; when not given, of the one that holds something.
     """
     join_graph(domain)
+    check_arms(arm)
     from openarm_grasp.ros.client import GraspClient
 
     with requires_node("grasp", "sim"), GraspClient() as client:

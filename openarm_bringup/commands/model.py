@@ -1,15 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm model`: the robot description in the form that another tool reads."""
+"""`openarm model`: the robot description in the form that another tool reads, and folders of further robots."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Literal
 
+from cyclopts import App
+
+from openarm_bringup.commands.connect import Robot
 from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import choose_robot, robot_name
+
+model = App(name="model", help="Write the robot for other tools; draft and check the folder of a robot.")
 
 
-def model(
+@model.default
+def write(
     kind: Literal["urdf", "mjcf", "srdf"],
     *,
     out: Path | None = None,
@@ -17,6 +25,7 @@ def model(
     scene: str | None = None,
     seed: int = 0,
     view: str = "three_quarter",
+    robot: Robot = None,
 ) -> Outcome:
     """Write the robot as URDF, MJCF or SRDF, or a picture of it.
 
@@ -28,6 +37,7 @@ def model(
         seed: Seed of a random scene.
         view: Of the picture: front, three_quarter, side, back, top, or the name of a camera.
     """
+    choose_robot(robot)
     from openarm_sim_bridge.world.export import export, render_png
 
     text = export(kind, scene, seed) if scene is None or kind == "mjcf" else export(kind)
@@ -39,7 +49,93 @@ def model(
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
         written.append(str(out))
-    data = {"kind": kind, "scene": scene, "written": written}
+    data = {"kind": kind, "robot": robot_name(), "scene": scene, "written": written}
     if written:
         return Outcome(True, f"wrote {', '.join(written)}", data=data)
     return Outcome(True, data={**data, "text": text}, text=text)
+
+
+@model.command
+def new(
+    name: str,
+    *,
+    mjcf: Path | None = None,
+    urdf: Path | None = None,
+    arm: tuple[str, ...] = (),
+    edits: Path | None = None,
+    samples: int = 60_000,
+    out: Path | None = None,
+) -> Outcome:
+    """Draft the folder of a robot, `models/robots/NAME`, from its maker's MJCF or URDF.
+
+    Args:
+        name: Of the robot.
+        mjcf: The maker's MJCF.
+        urdf: The maker's URDF, in place of an MJCF.
+        arm: NAME=BASE_LINK:TIP_LINK of an arm: what it stands on, and its tool centre point; may be repeated.
+        edits: YAML of what the MJCF lacks: velocity limits, boxes, pads, frames.
+        samples: Random states of the collision matrix.
+        out: Folder in which the robot's folder is made; without one, `models/robots`.
+    """
+    from openarm_common.resources import models_dir
+    from openarm_sim_bridge.drafting.check import folder_faults
+    from openarm_sim_bridge.drafting.draft import draft_folder
+
+    if (mjcf is None) == (urdf is None):
+        raise OpenArmError(Code.INVALID_ARGUMENT, "expected one of --mjcf and --urdf")
+    if not name.isidentifier():
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{name!r} names no robot, expected letters, digits and _")
+    folder = (models_dir() / "robots" if out is None else out) / name
+    source = mjcf or urdf or Path()
+    reasons = draft_folder(folder, source, dict(map(_arm, arm)), edits, samples)
+    always = sorted(" and ".join(sorted(pair)) for pair, reason in reasons.items() if reason == "Always")
+    faults = folder_faults(folder)
+    data = {"folder": str(folder), "always_touching": always, "faults": faults}
+    lines = [f"allowed, since they touch in every random state: {pair}" for pair in always]
+    text = "\n".join([*lines, *(f"to do: {fault}" for fault in faults)])
+    return Outcome(True, f"drafted {folder}: {len(faults)} to do", data=data, text=text)
+
+
+@model.command
+def semantics(name: str) -> Outcome:
+    """Write the SRDF of a robot anew from its `semantics.yaml`, with a sampled collision matrix; takes minutes.
+
+    Args:
+        name: Of the robot.
+    """
+    from openarm_common.robot.folder import load_folder
+    from openarm_sim_bridge.drafting.semantics import write_srdf
+
+    path, reasons = write_srdf(load_folder(name)[0])
+    count = {reason: list(reasons.values()).count(reason) for reason in sorted(set(reasons.values()))}
+    always = sorted(" and ".join(sorted(pair)) for pair, reason in reasons.items() if reason == "Always")
+    text = "\n".join(f"allowed, since they touch in every random state: {pair}" for pair in always)
+    what = ", ".join(f"{number} {reason}" for reason, number in count.items())
+    return Outcome(True, f"wrote {path}: {what}", data={"path": str(path), "pairs": count}, text=text)
+
+
+@model.command
+def check(name: str) -> Outcome:
+    """Say everything that is wrong with the folder of a robot: parts, meshes, limits, postures, contacts, MuJoCo.
+
+    Args:
+        name: Of the robot.
+    """
+    from openarm_common.robot.folder import load_folder
+    from openarm_sim_bridge.drafting.check import folder_faults
+
+    faults = folder_faults(load_folder(name)[0])
+    if faults:
+        text = "\n".join(faults)
+        message = f"{name}: {len(faults)} {'fault' if len(faults) == 1 else 'faults'}"
+        return Outcome(False, message, Code.CONFIG_INVALID, {"faults": faults}, text)
+    return Outcome(True, f"{name}: nothing is wrong", data={"faults": []})
+
+
+def _arm(text: str) -> tuple[str, tuple[str, str]]:
+    """Read NAME=BASE_LINK:TIP_LINK."""
+    name, _, links = text.partition("=")
+    base, _, tip = links.partition(":")
+    if not (name and base and tip):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--arm {text!r}: expected NAME=BASE_LINK:TIP_LINK")
+    return name, (base, tip)

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from openarm_bringup.commands.connect import Arms, Domain, join_graph, requires_node
+from openarm_bringup.commands.connect import Domain, check_arms, join_graph, requires_node
 from openarm_bringup.outcome import Outcome, as_text, console
 from openarm_common.errors import Code, OpenArmError
 
@@ -29,7 +29,7 @@ def pick(
     label: str = "",
     second: str = "",
     *,
-    arm: Arms = None,
+    arm: list[str] | None = None,
     at: list[tuple[float, float]] | None = None,
     place: list[tuple[float, float, float]] | None = None,
     yaw: list[float] | None = None,
@@ -69,6 +69,7 @@ def pick(
     if second and confirm:
         raise OpenArmError(Code.INVALID_ARGUMENT, "--confirm is of one object; use --dry-run to see the plan of two")
     join_graph(domain)
+    check_arms(*(arm or ()))
     from openarm_grasp.requests.request import GraspRequest
     from openarm_grasp.ros.client import GraspClient
 

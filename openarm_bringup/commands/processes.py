@@ -40,7 +40,8 @@ def ps(*, seconds: float = 0.3) -> Outcome:
         nodes = {name: {**node.model_dump(), **usage[name]} for name, node in record.nodes.items()}
         graphs.append({**record.model_dump(), "health": record.health, "nodes": nodes})
         lines.append(
-            f"{record.graph}: {record.health}, domain {record.domain}, supervisor {record.pid}, {record.run_dir}"
+            f"{record.graph}: {record.health}, robot {record.robot}, domain {record.domain}, supervisor {record.pid},"
+            f" {record.run_dir}"
         )
         lines.append(f"  {'node':<24}{'state':<10}{'pid':>8}{'cpu %':>8}{'MiB':>8}{'restarts':>10}")
         for name, node in nodes.items():

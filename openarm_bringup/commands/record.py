@@ -34,14 +34,14 @@ def record(
         image_rate: Keep at most this many frames a second of each camera; 0 keeps all.
     """
     join_graph(domain)
-    from openarm_bringup.bags.ros.listener import PROFILES
+    from openarm_bringup.bags.ros.listener import profiles
     from openarm_bringup.bags.ros.recorder import Recorder
 
     path = bag or Path(datetime.now().strftime("bag_%Y%m%d_%H%M%S"))
     number = int(os.environ.get("ROS_DOMAIN_ID") or "0")
     with (
         stop_event() as stop,
-        Recorder(number, path, topics or PROFILES[profile], _about(number), image_rate) as recorder,
+        Recorder(number, path, topics or profiles()[profile], _about(number), image_rate) as recorder,
     ):
         while not stop.is_set() and not recorder.wait_began(0.2):
             pass
@@ -109,6 +109,7 @@ def replay(
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"--rate, --start, --duration: 0 or more, got {rate, start, duration}"
         )
+    from openarm_bringup.bags.about import require_robot
     from openarm_bringup.bags.bag import open_bag
 
     names = dict(_split(pair) for pair in remap)
@@ -118,6 +119,7 @@ def replay(
             known = ", ".join(sorted(opened.topics))
             raise OpenArmError(Code.INVALID_ARGUMENT, f"not in {bag}: {', '.join(unknown)}; topics: {known}")
         join_graph(domain)
+        require_robot(opened)
         from openarm_bringup.bags.ros.player import Player
 
         with stop_event() as stop, Player(opened, topics or None, names, clock=clock) as player:
@@ -152,12 +154,14 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
         update: Write the numbers instead of comparing.
     """
     from openarm_bringup.bags import golden as stored
+    from openarm_bringup.bags.about import require_robot
     from openarm_bringup.bags.bag import open_bag
     from openarm_bringup.bags.ros.bag import numbers_of
     from openarm_bringup.progress import progress
 
     path = golden or (bag if bag.is_dir() else bag.parent) / "golden.json"
     with open_bag(bag) as opened, progress() as shown:
+        require_robot(opened)
         # A flight recording shows what went wrong; nobody knows beforehand which numbers it should give.
         shown_only = not update and golden is None and not path.exists() and "reason" in opened.custom
         expected = {} if shown_only or (update and not path.exists()) else stored.read(path)

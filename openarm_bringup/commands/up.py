@@ -6,10 +6,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from openarm_bringup.commands.connect import Sets
+from openarm_bringup.commands.connect import Robot, Sets
 from openarm_bringup.outcome import AT_END, Outcome, console, failure
 from openarm_bringup.supervision.discovery import Discovery, exposure
 from openarm_common.errors import OpenArmError
+from openarm_common.robot.folder import choose_robot, robot_name
 
 if TYPE_CHECKING:
     from openarm_bringup.supervision.graph import Graph
@@ -29,6 +30,7 @@ def up(
     discovery: Discovery | None = None,
     viz: bool = False,
     viz_port: int = 8765,
+    robot: Robot = None,
 ) -> Outcome:
     """Start the nodes of a graph, and stop them at Ctrl-C (a second Ctrl-C: emergency stop, and hurry).
 
@@ -42,6 +44,7 @@ def up(
         viz: Offer every topic and service to Foxglove, at an address that is printed.
         viz_port: TCP port for that.
     """
+    choose_robot(robot)
     import asyncio
 
     from openarm_bringup.supervision.graph import load_graph, set_parameter
@@ -75,7 +78,8 @@ async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
         shown.print(f"{event.state:<9}", style=style, end=" ")
         shown.print(line, markup=False, soft_wrap=True)
 
-    data: dict[str, Any] = {"graph": graph.name, "run_dir": str(run_dir), "domain": domain_id(graph)}
+    data: dict[str, Any] = {"graph": graph.name, "robot": robot_name(), "run_dir": str(run_dir)}
+    data["domain"] = domain_id(graph)
     if warning := exposure(graph.discovery):
         shown.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
     try:
@@ -85,7 +89,7 @@ async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
             supervisor.daemon.start()  # it has nothing to compete with any more
             shown.print(
                 f"[bold green]{graph.name} is ready[/bold green] after {data['ready_s']:.1f} s: "
-                f"domain {data['domain']}, logs in {run_dir / 'logs'}; Ctrl-C stops it",
+                f"{data['robot']}, domain {data['domain']}, logs in {run_dir / 'logs'}; Ctrl-C stops it",
                 soft_wrap=True,
             )
             if viz_address:

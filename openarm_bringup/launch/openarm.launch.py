@@ -19,9 +19,11 @@ from openarm_bringup.supervision.environment import node_arguments, node_environ
 from openarm_bringup.supervision.graph import graph_names, load_graph
 from openarm_bringup.supervision.runs import new_run_dir
 from openarm_common.resources import config_dir
+from openarm_common.robot.folder import choose_robot
 
 #: Name, default and meaning; an empty value leaves what the graph says.
 ARGUMENTS = (
+    ("robot", "", "name of a folder of models/robots"),
     ("graph", "sim", f"one of {', '.join(graph_names())}, or a file"),
     ("scene", "", "name or path of a scene, or random"),
     ("seed", "", "of a random scene"),
@@ -41,6 +43,7 @@ def generate_launch_description() -> LaunchDescription:
 def start(context: LaunchContext) -> list[ExecuteProcess]:
     """Make one process a node."""
     given = {name: LaunchConfiguration(name).perform(context) for name, _, _ in ARGUMENTS}
+    choose_robot(given["robot"] or None)
     overrides = {name: given[name] or None for name in ("scene", "seed", "mount_seed", "domain")}
     graph = load_graph(given["graph"], overrides=overrides, sets=shlex.split(given["set"]))
     run_dir = new_run_dir()

@@ -3,7 +3,7 @@
 
 A graph names its nodes, what each needs before it starts, when it counts as ready, and its parameters. A file can
 extend another one and keep only some of its nodes. `${scene}`, `${seed}` and `${mount_seed}` in parameters are
-replaced by the graph's own top-level values.
+replaced by the graph's own top-level values, `${arm}`, `${camera}` and `${hand_camera}` as in `supervision.parts`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from pydantic import Field, model_validator
 
 from openarm_bringup.supervision.discovery import LAST_DOMAIN, Discovery
 from openarm_bringup.supervision.params import flatten, read_params, substitute
+from openarm_bringup.supervision.parts import for_each_part
 from openarm_common.config import Config, ConfigT, load_yaml, parse_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
-from openarm_common.resources import config_dir, is_file
+from openarm_common.resources import config_dir, is_file, models_dir
+from openarm_common.robot.folder import robot_name
 
 ConditionKind = Literal["topic", "message", "service", "action"]
 
@@ -180,8 +182,12 @@ class Graph(Config):
 
 
 def graph_names() -> list[str]:
-    """Return the names of the graphs that come with the suite."""
-    return sorted(path.stem for path in (config_dir() / "graphs").glob("*.yaml"))
+    """Return the names of the graphs that come with the suite: of all robots, and of this process's robot alone."""
+    return sorted({path.stem for folder in _folders() for path in folder.glob("*.yaml")})
+
+
+def _folders() -> tuple[Path, Path]:
+    return models_dir() / "robots" / robot_name() / "graphs", config_dir() / "graphs"
 
 
 def find_graph(name: str) -> Path:
@@ -190,8 +196,7 @@ def find_graph(name: str) -> Path:
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the graphs that exist.
     """
-    known = config_dir() / "graphs" / f"{name}.yaml"
-    for path in (known, Path(name)):
+    for path in (*(folder / f"{name}.yaml" for folder in _folders()), Path(name)):
         if is_file(path):
             return path
     raise OpenArmError(
@@ -235,7 +240,7 @@ def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
         raise OpenArmError(
             Code.CONFIG_INVALID, f"{path}:extends: {' → '.join(p.name for p in (*trail, path))} is a circle"
         )
-    graph: dict[str, Any] = {"name": path.stem, **load_yaml(path)}
+    graph: dict[str, Any] = {"name": path.stem, **for_each_part(load_yaml(path))}
     base_name, only = graph.pop("extends", None), graph.pop("only", None)
     _require_mappings(graph.get("nodes"), path)
     if base_name is not None:

@@ -23,6 +23,7 @@ from pydantic import ValidationError
 from openarm_bringup.supervision.state import foreign, state_dir
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import DEFAULT, robot_name
 
 #: Folder of a run with its flight recordings, and the name of one.
 RECORDINGS, RECORDING = "recordings", re.compile(r"\d+_\w+")
@@ -41,6 +42,7 @@ class RunRecord(Config):
     """One running graph."""
 
     graph: str
+    robot: str = DEFAULT
     pid: int
     pid_created: float
     domain: int
@@ -188,14 +190,18 @@ def own() -> RunRecord | None:
 
 
 def refuse_twins(domain: int, nodes: Iterable[str]) -> None:
-    """Refuse nodes that run in a domain already: commands would reach both of a name.
+    """Refuse nodes that run in a domain already, where commands would reach both of a name, and another robot there.
 
     Raises:
         OpenArmError: BUSY, naming the graph that has them.
     """
     for run in running():
-        twins = [name for name in nodes if name in run.nodes]
-        if twins and run.domain == domain and run.pid != os.getpid():
+        if run.domain != domain or run.pid == os.getpid():
+            continue
+        if run.robot != robot_name():
+            text = f"{run.graph} (supervisor {run.pid}) runs in domain {domain} with robot {run.robot!r}"
+            raise OpenArmError(Code.BUSY, f"{text}, this graph is of {robot_name()!r}: start it in another (--domain)")
+        if twins := [name for name in nodes if name in run.nodes]:
             raise OpenArmError(
                 Code.BUSY,
                 f"{run.graph} (supervisor {run.pid}) runs in domain {domain} and has {', '.join(twins)} already: end "

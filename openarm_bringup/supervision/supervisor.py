@@ -29,6 +29,7 @@ from openarm_bringup.supervision.log import LogFile
 from openarm_bringup.supervision.ports import HeldPorts
 from openarm_bringup.supervision.process import Ladder
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import robot_name
 
 T = TypeVar("T")
 
@@ -99,6 +100,7 @@ class Supervisor:
             OpenArmError: BUSY, when a node of the graph runs in its domain already; ENVIRONMENT, when /dev/shm is too
                 small for it.
         """
+        self.say(f"graph {self.graph.name} of robot {robot_name()}")
         runs.refuse_twins(environment.domain_id(self.graph), self.graph.nodes)
         shm.check_shm(self.graph)
         (self.run_dir / "logs").mkdir(parents=True, exist_ok=True)
@@ -289,6 +291,7 @@ class Supervisor:
         }
         record = runs.RunRecord(
             graph=self.graph.name,
+            robot=robot_name(),
             pid=me.pid,
             pid_created=me.create_time(),
             domain=environment.domain_id(self.graph),

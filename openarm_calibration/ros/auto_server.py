@@ -103,15 +103,15 @@ class _Run:
         self, node: CalibrationNode, mover: ActionClient, handle: ServerGoalHandle, result: AutoCalibrate.Result
     ) -> None:
         self._node, self._mover, self._handle, self._result = node, mover, handle, result
-        head = node.samples.head
-        self._arm = node.description.arm_of(head.parent if head.setup == "in_hand" else head.carrier)
         self._goal: AutoCalibrate.Goal = handle.request
         self._config = config = node.config.auto
         node.use(self._goal.camera or node.camera.name)
+        head = node.samples.head
+        self._arm = node.description.arm_of(head.parent if head.setup == "in_hand" else head.carrier)
         self._poses = int(self._goal.poses) or config.poses
         self._enough_t = self._goal.sigma_translation or config.sigma_translation
         self._enough_r = self._goal.sigma_rotation or config.sigma_rotation
-        fixed = node.samples.head.setup == "to_hand"
+        fixed = head.setup == "to_hand"
         place = (config.on_hand if fixed else config.on_table).pose
         self._fixed = fixed
         self._search = PoseSearch(node.description, node.camera.T_parent_optical, place, config.search)

@@ -14,11 +14,11 @@ from collections.abc import Callable
 from openarm_interfaces.action import AutoCalibrate
 from openarm_interfaces.srv import GetSampleList, MeasureTable, RemoveSample, SampleFile, SaveTable, TakeSample
 
+from openarm_common.camera.cameras import detector_nodes
 from openarm_common.errors import Code
 from openarm_common.ros.client import BackgroundNode
 
-#: Nodes that measure the table, by camera; and how long they may need for an image, s.
-DETECTORS = {"overhead": "detector", "wrist": "wrist_detector"}
+#: How long the detector that measures the table may need for an image, and the pause between two requests, s.
 _IMAGE_S, _AGAIN_S = 10.0, 0.25
 
 OnFeedback = Callable[[AutoCalibrate.Feedback], None]
@@ -93,14 +93,14 @@ class CalibrationClient(BackgroundNode):
         """Measure the height of the table by a camera's detector, which waits for its next image.
 
         Args:
-            camera: One of `DETECTORS`.
+            camera: One with a detector.
             block_height: Of a block whose top is measured, m; 0: the surface of the table.
             label: Of that block.
         """
         request = MeasureTable.Request(block_height=block_height, label=label)
         deadline = time.monotonic() + _IMAGE_S
         while True:
-            answer = self.call(MeasureTable, f"/{DETECTORS[camera]}/measure_table", request)
+            answer = self.call(MeasureTable, f"/{detector_nodes()[camera]}/measure_table", request)
             if answer.code != Code.NOT_READY or time.monotonic() > deadline:
                 return answer
             time.sleep(_AGAIN_S)  # the image was asked for just now

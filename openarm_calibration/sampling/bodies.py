@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Many postures at once: where a link is; whether the robot hides something from a camera, or is in its own way.
 
-Hiding and contact go by boxes around the collision shapes. This sorts postures out before a planner is asked, fast and
-roughly: for contact the boxes are a little smaller than the shapes, for sight a little larger. Root frame, m.
+Contact goes by boxes around the collision shapes, hiding by boxes and, where a shape is a hull, by its faces. This
+sorts postures out before a planner is asked, fast and roughly: for contact the boxes are a little smaller than the
+shapes, for sight they are a little larger. Root frame, m.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from openarm_calibration.handeye.problem import exps
 from openarm_common.robot.description import RobotDescription
@@ -63,6 +65,12 @@ class Bodies:
         half = np.array(edges).reshape(-1, 3) / 2.0
         self._large: Array = half + _SKIN
         self._small: Array = np.maximum(half * np.where(box, 1.0, (_CYLINDER, _CYLINDER, 1.0)) - _SKIN, 1e-4)
+        #: Faces (k, 4) of hulls by index, moved outwards by the same: normal, and minus its distance from the origin.
+        self._faces: dict[int, Array] = {
+            i: ConvexHull(shape.corners).equations - (0.0, 0.0, 0.0, _SKIN)
+            for i, (_, shape) in enumerate(shapes)
+            if shape.corners is not None
+        }
         allowed = description.allowed_collisions
         pairs = [
             (i, j)
@@ -96,6 +104,8 @@ class Bodies:
     def hidden(self, shapes: Array, eye: Array, points: Array) -> bool:
         """Return whether a shape lies between the eye (3,) and any of the points (n, 3); `shapes` from `place`.
 
+        What the eye is in is the mount of the camera, which hides nothing.
+
         Args:
             shapes: (n, 4, 4), from `place`.
             eye: (3,), m.
@@ -109,4 +119,18 @@ class Bodies:
         half = self._large[:, None]
         one, other = (-half - start) / way, (half - start) / way
         enter, leave = np.minimum(one, other).max(axis=2), np.maximum(one, other).min(axis=2)
-        return bool(((enter <= leave) & (leave > 0.0) & (enter < 1.0)).any())
+        met = (enter <= leave) & (leave > 0.0) & (enter < 1.0)
+        return any(
+            _meets(self._faces[i], start[i, 0], way[i]) if i in self._faces else bool((met[i] & (enter[i] > 0.0)).any())
+            for i in np.flatnonzero(met.any(axis=1)).tolist()
+        )
+
+
+def _meets(faces: Array, start: Array, ways: Array) -> bool:
+    """Return whether one of the lines from a point (3,) outside along ways (n, 3) meets a hull of faces (k, 4)."""
+    speed, above = ways @ faces[:, :3].T, faces[:, :3] @ start + faces[:, 3]
+    at = -above / np.where(np.abs(speed) < 1e-12, 1e-12, speed)
+    enter = np.where(speed < 0.0, at, -np.inf).max(axis=1)
+    leave = np.where(speed > 0.0, at, np.inf).min(axis=1)
+    beside = ((np.abs(speed) < 1e-12) & (above > 0.0)).any(axis=1)
+    return bool(((enter <= leave) & (enter > 0.0) & (enter < 1.0) & ~beside).any())

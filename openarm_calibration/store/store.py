@@ -17,15 +17,16 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config, validate
 from openarm_common.errors import OpenArmError
-from openarm_common.records import Found, Record, RecordStore
-from openarm_common.resources import config_dir
+from openarm_common.records import Found, OfAnotherRobot, Record, RecordStore
+from openarm_common.resources import models_dir
+from openarm_common.robot.folder import robot_name
 from openarm_common.types import Array
 
 
 class StoreConfig(Config):
     """Where calibrations are stored, and which mounts are in use."""
 
-    cameras: str = Field(default="", description="YAML of the cameras; empty is config/params/cameras.yaml")
+    cameras: str = Field(default="", description="YAML of the cameras; empty is that of the robot's folder")
     store: str = Field(
         default="",
         description="folder of stored calibrations; empty: OPENARM_CALIBRATIONS or ~/.local/share/openarm/calibrations",
@@ -124,8 +125,9 @@ class StoredCalibration(Record):
         return self.camera
 
     def fields(self) -> dict[str, Any]:
-        """Return what is written and hashed; a file of old has no intrinsics and keeps its hash."""
-        return self.model_dump(mode="json", exclude={"intrinsics"} if self.intrinsics is None else None)
+        """Return what is written and hashed; a file of old has no intrinsics, or no robot, and keeps its hash."""
+        fields = super().fields()
+        return fields if self.intrinsics else {key: value for key, value in fields.items() if key != "intrinsics"}
 
 
 class CalibrationStore(RecordStore[StoredCalibration]):
@@ -139,20 +141,24 @@ class CalibrationStore(RecordStore[StoredCalibration]):
         super().__init__(folder, StoredCalibration, "calibration")
 
     def in_use(self, camera: str, mount_seed: int | None) -> StoredCalibration | None:
-        """Return what is stored of a camera; None also for other mounts, whose distance says nothing."""
-        found = self.find(camera)
+        """Return what is stored of a camera; None also for other mounts or robots, whose distance says nothing."""
+        try:
+            found = self.find(camera)
+        except OfAnotherRobot:
+            return None
         return found.record if found is not None and found.record.mount_seed == mount_seed else None
 
 
 def places(folder: Path, mount_seed: int | None) -> tuple[CalibrationStore, ...]:
     """List where calibrations of the mounts in use are searched; the first that has one wins.
 
-    That is the folder itself; for simulated mounts also its subfolder of that seed, and what comes with the suite.
+    That is the folder itself; for simulated mounts also its subfolder of that seed, and what comes with the robot.
     """
     stores = [CalibrationStore(folder)]
     if mount_seed is not None:
         name = f"mount_seed_{mount_seed}"
-        stores += [CalibrationStore(folder / name), CalibrationStore(config_dir() / "calibration" / name)]
+        shipped = models_dir() / "robots" / robot_name() / "calibration"
+        stores += [CalibrationStore(folder / name), CalibrationStore(shipped / name)]
     return tuple(stores)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import Field
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.records import Record, RecordStore
+from openarm_common.records import OfAnotherRobot, Record, RecordStore
 
 #: Name of the record, and of the folder below that of the calibrations.
 TABLE = "table"
@@ -55,6 +55,8 @@ class TableStore(RecordStore[StoredTable]):
         nominal = "of the scene"
         try:
             found = self.find(TABLE)
+        except OfAnotherRobot as error:
+            return configured, f"{nominal}; {error.message}", ""
         except OpenArmError as error:
             return configured, nominal, error.message
         if found is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of the suite: mounts, frames and pinhole intrinsics.
+"""Cameras of a robot: mounts, frames and pinhole intrinsics.
 
 Frames of a camera `name` (REP-103, REP-105): `<name>_link` has x forward, y left, z up; `<name>_color_optical_frame`
 has z forward, x right, y down. Depth is aligned with colour, so images, CameraInfo and points share the optical
@@ -20,7 +20,7 @@ from pydantic import Field, field_validator
 from openarm_common import se3
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import config_dir
+from openarm_common.robot.folder import load_folder, per_robot, robot_name
 from openarm_common.types import Array, Floats
 
 Vector3 = tuple[float, float, float]
@@ -156,27 +156,73 @@ def load_cameras(path: Path | None = None) -> dict[str, CameraConfig]:
     """Read the cameras, by name.
 
     Args:
-        path: YAML with a list `cameras`; None is the suite's `config/params/cameras.yaml`.
+        path: YAML with a list `cameras`; None is that of this process's robot, which may have none.
 
     Raises:
         OpenArmError: CONFIG_INVALID, naming file and key, or the camera that is there twice.
     """
-    source = path or config_dir() / "params" / "cameras.yaml"
-    cameras = validate(_CamerasFile, load_yaml(source), str(source)).cameras
+    if path is None:
+        folder, robot = load_folder(robot_name())
+        if not robot.cameras:
+            return {}
+        path = folder / robot.cameras
+    cameras = validate(_CamerasFile, load_yaml(path), str(path)).cameras
     by_name = {camera.name: camera for camera in cameras}
     if len(by_name) != len(cameras):
         names = sorted(camera.name for camera in cameras)
-        raise OpenArmError(Code.CONFIG_INVALID, f"{source}:cameras: names must be unique, got {', '.join(names)}")
+        raise OpenArmError(Code.CONFIG_INVALID, f"{path}:cameras: names must be unique, got {', '.join(names)}")
     return by_name
 
 
+def depth_cameras() -> dict[str, CameraConfig]:
+    """Return the cameras of this process's robot that have depth, by name."""
+    return {name: camera for name, camera in load_cameras().items() if camera.depth}
+
+
+def uncertain_cameras() -> tuple[str, ...]:
+    """Return the names of the cameras whose mounts are to be calibrated."""
+    return tuple(name for name, camera in load_cameras().items() if camera.mount_error)
+
+
+def hand_cameras() -> tuple[str, ...]:
+    """Return the names of the cameras with depth that move with a hand."""
+    arms = load_folder(robot_name())[1].arms.values()
+    moving = {link for arm in arms for link in (arm.flange, arm.hand, arm.tcp, *arm.fingers)}
+    return tuple(name for name, camera in depth_cameras().items() if camera.parent in moving)
+
+
+@per_robot
+def table_camera() -> str:
+    """Return the name of the camera that looks at the table: the first with depth that no hand carries; "": none."""
+    on_hands = hand_cameras()
+    return next((name for name in depth_cameras() if name not in on_hands), "")
+
+
+@per_robot
+def near_camera() -> str:
+    """Return the name of the camera for second looks: the first that a hand carries; "": none."""
+    return next(iter(hand_cameras()), "")
+
+
+@per_robot
+def spectator_camera() -> str:
+    """Return the name of the camera for people: the first without depth, or else the one that looks at the table."""
+    return next((name for name, camera in load_cameras().items() if not camera.depth), table_camera())
+
+
+def detector_nodes() -> dict[str, str]:
+    """Return the nodes that detect, by camera: `detector` looks at the table, NAME_detector from a hand."""
+    first = {table_camera(): "detector"} if table_camera() else {}
+    return first | {name: f"{name}_detector" for name in hand_cameras()}
+
+
 def depth_camera(name: str) -> CameraConfig:
-    """Return a camera of the suite that has depth.
+    """Return a camera of this process's robot that has depth.
 
     Raises:
         OpenArmError: CONFIG_INVALID, listing those that there are.
     """
-    cameras = {key: camera for key, camera in load_cameras().items() if camera.depth}
+    cameras = depth_cameras()
     if name not in cameras:
         raise OpenArmError(
             Code.CONFIG_INVALID, f"camera {name!r} is unknown or has no depth; cameras: {', '.join(cameras)}"

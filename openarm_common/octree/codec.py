@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -38,6 +38,8 @@ MAX_FILE_BYTES = 256 * 2**20
 _PART = 1 << 14
 _FIRST_LINE = {".bt": "# Octomap OcTree binary file", ".ot": "# Octomap OcTree file"}
 _NOTE = "# (feel free to add / change comments, but leave the first line as it is!)\n#"
+#: A comment, which liboctomap skips: the robot in whose base frame the map is.
+_ROBOT = "# robot "
 
 
 @dataclass(frozen=True)
@@ -137,12 +139,14 @@ class Leaves:
         raw: The tree, sound.
         binary: Which form it has.
         nodes: Nodes of the tree, inner ones too.
+        robot: In whose base frame it is; "" where a file does not say it, as those of other programs.
     """
 
     resolution: float
     raw: Bytes
     binary: bool
     nodes: int
+    robot: str = ""
 
     def arrays(self) -> tuple[NDArray[np.int32], Floats]:
         """Return (n, 4) level, x, y, z key at that level, and log-odds (n,)."""
@@ -250,13 +254,14 @@ def decode(data: Bytes | bytes, resolution: float, *, binary: bool) -> Leaves:
     return Leaves(resolution, raw, binary, reader.nodes if raw.size else 0)
 
 
-def write_file(path: Path, payload: Payload, resolution: float) -> None:
+def write_file(path: Path, payload: Payload, resolution: float, robot: str = "") -> None:
     """Write a .bt (binary) or .ot (full) file; the file is there whole or not at all.
 
     Args:
         path: Ends in .bt or .ot.
         payload: The tree.
         resolution: Edge of a cell, m.
+        robot: In whose base frame it is; "" is not written.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the suffix does not fit the payload or the folder can't be written.
@@ -264,10 +269,11 @@ def write_file(path: Path, payload: Payload, resolution: float) -> None:
     suffix = ".bt" if payload.binary else ".ot"
     if path.suffix != suffix:
         raise _invalid(f"{path.name}: the {suffix[1:]} form needs the suffix {suffix}")
-    text = f"{_FIRST_LINE[suffix]}\n{_NOTE}\nid {TREE_ID}\nsize {payload.nodes}\nres {resolution:g}\ndata\n"
+    whose = f"{_ROBOT}{' '.join(robot.split())}\n" if robot else ""
+    text = f"{_FIRST_LINE[suffix]}\n{_NOTE}\n{whose}id {TREE_ID}\nsize {payload.nodes}\nres {resolution:g}\ndata\n"
     if not path.parent.is_dir():
         raise _invalid(f"{path} can't be written: there is no folder {path.parent}")
-    write_whole(path, text.encode("ascii") + payload.data.tobytes(), Code.INVALID_ARGUMENT)
+    write_whole(path, text.encode() + payload.data.tobytes(), Code.INVALID_ARGUMENT)
 
 
 def read_file(path: Path) -> Leaves:
@@ -291,7 +297,7 @@ def read_file(path: Path) -> Leaves:
 
 def _parse(content: bytes) -> Leaves:
     head, found, data = content.partition(b"\ndata\n")
-    lines = head.decode("ascii", errors="replace").splitlines() if found else []
+    lines = head.decode(errors="replace").splitlines() if found else []
     forms = [suffix for suffix, first in _FIRST_LINE.items() if lines and lines[0].startswith(first)]
     if not forms:
         first = " or ".join(map(repr, _FIRST_LINE.values()))
@@ -306,7 +312,8 @@ def _parse(content: bytes) -> Leaves:
     leaves = decode(data, resolution, binary=forms[0] == ".bt")
     if leaves.nodes != nodes:
         raise _damaged(f"has {leaves.nodes} nodes, its header says {nodes}")
-    return leaves
+    whose = next((line.removeprefix(_ROBOT) for line in lines if line.startswith(_ROBOT)), "")
+    return replace(leaves, robot=whose)
 
 
 def _damaged(what: str) -> OpenArmError:

@@ -20,10 +20,13 @@ import xacro
 
 from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import is_file
 from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, robot_name
+from openarm_common.robot.hand import Hand
+from openarm_common.robot.meshes import take_meshes
 from openarm_common.robot.srdf import Semantics, parse_srdf
 from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf
-from openarm_common.robot.xml_text import fault
+from openarm_common.robot.xml_text import fault, parse_root
 from openarm_common.types import Array
 
 __all__ = ["Joint", "Link", "Primitive", "RobotDescription"]
@@ -43,6 +46,7 @@ class RobotDescription:
         semantics: What the SRDF says.
         base: Base frame.
         arms: By name.
+        hands: By arm.
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
     """
 
@@ -56,6 +60,7 @@ class RobotDescription:
     _chains: Mapping[str, tuple[Joint, ...]] = field(repr=False)
     base: str = ""
     arms: Mapping[str, ArmParts] = field(default_factory=dict[str, ArmParts])
+    hands: Mapping[str, Hand] = field(default_factory=dict[str, Hand])
     mirror: tuple[float, ...] = ()
 
     @classmethod
@@ -74,17 +79,38 @@ class RobotDescription:
     def from_folder(cls, name: str) -> RobotDescription:
         """Read a robot of `models/robots`; as `load`."""
         folder, parts = load_folder(name)
-        source = folder / parts.xacro
-        try:
-            document = xacro.process_file(str(source))
-        except xacro.XacroException as error:
-            raise OpenArmError(Code.CONFIG_INVALID, f"{source}: {error}") from error
-        root = ET.fromstring(document.toxml())  # drops xacro's comments, which name the folder it ran in
+        robot = cls.from_files(folder / (parts.xacro or parts.urdf), folder / parts.srdf)
+        if faults := part_faults(parts, robot):
+            raise OpenArmError(Code.CONFIG_INVALID, f"{folder / 'robot.yaml'}: {'; '.join(faults)}")
+        return robot.of_folder(name, parts)
+
+    @classmethod
+    def from_files(
+        cls, urdf: Path, srdf: Path | None = None, packages: Mapping[str, Path] | None = None
+    ) -> RobotDescription:
+        """Read a robot from files; collision meshes become convex hulls, see `openarm_common.robot.meshes`.
+
+        Args:
+            urdf: The description; what is named `.xacro` is expanded.
+            srdf: Pairs of links that may touch, and postures; without it, neighbours may touch.
+            packages: Folders of packages that mesh files are named by, where they are not installed.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, naming the file that is missing or faulty.
+        """
+        for path in (urdf, *([] if srdf is None else [srdf])):
+            if not is_file(path):
+                raise OpenArmError(Code.CONFIG_INVALID, f"there is no file {path}")
+        root = parse_root(_expanded(urdf) if urdf.suffix == ".xacro" else read_text(urdf), str(urdf))
+        hulls = take_meshes(root, urdf, packages)
         ET.indent(root)
-        urdf = ET.tostring(root, encoding="unicode") + "\n"
-        robot = cls.from_urdf(urdf, read_text(folder / parts.srdf))
-        _check_parts(parts, robot, folder / "robot.yaml")
-        return replace(robot, name=name, base=parts.base, arms=parts.arms, mirror=parts.mirror)
+        text = ET.tostring(root, encoding="unicode") + "\n"  # drops xacro's comments, which name the folder it ran in
+        robot = cls.from_urdf(text, "" if srdf is None else read_text(srdf))
+        links = {
+            name: replace(link, collision=(*link.collision, *hulls.get(name, ())), unread=())
+            for name, link in robot.links.items()
+        }
+        return replace(robot, links=MappingProxyType(links))
 
     @classmethod
     def from_urdf(cls, urdf: str, srdf: str = "") -> RobotDescription:
@@ -118,6 +144,12 @@ class RobotDescription:
             _chains=MappingProxyType(chains),
         )
 
+    def of_folder(self, name: str, parts: RobotFolder) -> RobotDescription:
+        """Return the robot with the name of its folder and what `robot.yaml` says."""
+        hand, arms = parts.hand, parts.arms
+        hands = {key: Hand(arm.finger_joint, arm.finger_sign, hand) for key, arm in arms.items()} if hand else {}
+        return replace(self, name=name, base=parts.base, arms=arms, hands=hands, mirror=parts.mirror)
+
     @property
     def arm_names(self) -> tuple[str, ...]:
         """Names of the arms."""
@@ -137,6 +169,18 @@ class RobotDescription:
     def arm_joints(self, arm: str) -> tuple[str, ...]:
         """Return the names of the joints of an arm, from the shoulder."""
         return self.arm(arm).joints
+
+    def hand(self, arm: str) -> Hand:
+        """Return the hand of an arm.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, as `arm`; CONFIG_INVALID, when nothing is said of hands.
+        """
+        self.arm(arm)
+        if arm not in self.hands:
+            text = f"robot {self.name!r} has no hand: its robot.yaml lacks `hand`"
+            raise OpenArmError(Code.CONFIG_INVALID, text)
+        return self.hands[arm]
 
     def finger_joint(self, arm: str) -> str:
         """Return the name of the joint that drives the fingers of a hand."""
@@ -279,8 +323,15 @@ def _loaded(name: str) -> RobotDescription:
     return RobotDescription.from_folder(name)
 
 
-def _check_parts(parts: RobotFolder, robot: RobotDescription, path: Path) -> None:
-    """Raise CONFIG_INVALID, naming every link, joint and group of a folder that its URDF and SRDF don't have."""
+def _expanded(source: Path) -> str:
+    try:
+        return xacro.process_file(str(source)).toxml()
+    except xacro.XacroException as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{source}: {error}") from error
+
+
+def part_faults(parts: RobotFolder, robot: RobotDescription) -> list[str]:
+    """Return every link, joint and group of a folder that its URDF and SRDF don't have."""
     faults = [] if parts.base in robot.links else [f"base: no link {parts.base!r}"]
     for name, arm in parts.arms.items():
         links = [arm.base, arm.flange, arm.hand, arm.tcp, *arm.fingers]
@@ -289,8 +340,7 @@ def _check_parts(parts: RobotFolder, robot: RobotDescription, path: Path) -> Non
         faults += [f"arms.{name}: no joint {joint!r}" for joint in joints if joint not in robot.joints]
         if f"{name}_arm" not in robot.semantics.groups:
             faults.append(f"arms.{name}: the SRDF has no group {name}_arm")
-    if faults:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{path}: {'; '.join(faults)}")
+    return faults
 
 
 def _chain_of(link: str, parent_joint: Mapping[str, Joint]) -> tuple[Joint, ...]:

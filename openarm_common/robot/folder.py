@@ -4,15 +4,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import cache, wraps
 from pathlib import Path
-from typing import Self
+from typing import Literal, ParamSpec, Self, TypeVar
 
 from pydantic import Field, model_validator
 
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
+from openarm_common.robot.hand import HandParts
+from openarm_common.robot.work import Work
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 #: Names the robot of a process.
 ROBOT = "OPENARM_ROBOT"
@@ -29,6 +35,7 @@ class ArmParts(Config):
         hand: Link that the fingers move on.
         tcp: Link of the tool centre point: z out of the fingers, y the opening direction.
         finger_joint: That drives the fingers.
+        finger_sign: Of its positions, against those of the robot's hand.
         fingers: Their links; the pad of each is its collision shape `{link}_pad_collision`.
     """
 
@@ -38,6 +45,7 @@ class ArmParts(Config):
     hand: str
     tcp: str
     finger_joint: str
+    finger_sign: Literal[-1, 1] = 1
     fingers: tuple[str, ...] = Field(min_length=1)
 
     @property
@@ -50,18 +58,33 @@ class RobotFolder(Config):
     """What `robot.yaml` says; paths are relative to it.
 
     Attributes:
-        xacro: Makes the URDF.
+        xacro: Makes the URDF; this or `urdf`.
+        urdf: The URDF as it is.
         srdf: Pairs of links that may touch, groups and postures.
+        cameras: YAML of the cameras; "": it has none.
         base: Base frame: x forward, y left, z up, on the floor.
+        hand: What the fingers of each arm can do; None: nothing is known of them.
         arms: By name; the group of each in the SRDF is `NAME_arm`.
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
+        work: Where it works; None: it has no table, and no scenes.
     """
 
-    xacro: str
+    xacro: str = ""
+    urdf: str = ""
     srdf: str
+    cameras: str = ""
     base: str
+    hand: HandParts | None = None
     arms: Mapping[str, ArmParts] = Field(min_length=1)
     mirror: tuple[float, ...] = ()
+    work: Work | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if bool(self.xacro) == bool(self.urdf):
+            text = f"expected one of xacro and urdf, got {'both' if self.xacro else 'neither'}"
+            raise ValueError(text)
+        return self
 
     @model_validator(mode="after")
     def _signs(self) -> Self:
@@ -77,9 +100,48 @@ def robot_name() -> str:
     return os.environ.get(ROBOT, "") or DEFAULT
 
 
+def choose_robot(name: str | None) -> None:
+    """Let the robot of this process, and of those that it starts, be another one; None leaves it.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, listing the robots there are.
+    """
+    if name is not None:
+        _check_name(name)
+        os.environ[ROBOT] = name
+
+
+def other_robot(name: str) -> str:
+    """Return why what is of a robot is not for this process; empty when it is."""
+    mine = robot_name()
+    if name == mine:
+        return ""
+    return f"is of robot {name[:80]!r}, expected {mine!r}; take one of this robot, or name the other by {ROBOT}"
+
+
+def per_robot(function: Callable[P, R]) -> Callable[P, R]:
+    """Cache a function by its arguments, which can be hashed, and by the folder of this process's robot."""
+
+    @cache
+    def made(folder: Path, *args: P.args, **kwargs: P.kwargs) -> R:
+        return function(*args, **kwargs)
+
+    @wraps(function)
+    def of_this_robot(*args: P.args, **kwargs: P.kwargs) -> R:
+        return made(models_dir() / "robots" / robot_name(), *args, **kwargs)
+
+    return of_this_robot
+
+
 def robot_names() -> tuple[str, ...]:
     """Return the robots there are."""
     return tuple(sorted(path.parent.name for path in (models_dir() / "robots").glob("*/robot.yaml")))
+
+
+def _check_name(name: str) -> None:
+    if name not in robot_names():
+        text = f"no robot {name[:80]!r}; robots: {', '.join(robot_names())}"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
 
 
 def arm_fault(arm: str, arms: Collection[str]) -> str:
@@ -104,8 +166,44 @@ def load_folder(name: str) -> tuple[Path, RobotFolder]:
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the robots there are; CONFIG_INVALID, naming what is wrong.
     """
-    if name not in robot_names():
-        text = f"no robot {name[:80]!r}; robots: {', '.join(robot_names())}"
-        raise OpenArmError(Code.INVALID_ARGUMENT, text)
-    path = models_dir() / "robots" / name / "robot.yaml"
-    return path.parent, validate(RobotFolder, load_yaml(path), str(path))
+    _check_name(name)
+    folder = models_dir() / "robots" / name
+    return folder, read_folder(folder)
+
+
+def read_folder(folder: Path) -> RobotFolder:
+    """Read `robot.yaml` of a folder, wherever it is.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming what is wrong.
+    """
+    path = folder / "robot.yaml"
+    return validate(RobotFolder, load_yaml(path), str(path))
+
+
+@per_robot
+def robot_hand() -> HandParts:
+    """Return the hand of this process's robot.
+
+    Raises:
+        OpenArmError: As `load_folder`; CONFIG_INVALID, when its `robot.yaml` does not say it.
+    """
+    path, robot = load_folder(robot_name())
+    if robot.hand is None:
+        text = f"{path / 'robot.yaml'}:hand: missing; it says what the fingers are and can do"
+        raise OpenArmError(Code.CONFIG_INVALID, text)
+    return robot.hand
+
+
+@per_robot
+def robot_work() -> Work:
+    """Return where this process's robot works.
+
+    Raises:
+        OpenArmError: As `load_folder`; CONFIG_INVALID, when its `robot.yaml` does not say it.
+    """
+    path, robot = load_folder(robot_name())
+    if robot.work is None:
+        text = f"{path / 'robot.yaml'}:work: missing; it says where the table and the objects before the robot are"
+        raise OpenArmError(Code.CONFIG_INVALID, text)
+    return robot.work

@@ -57,12 +57,18 @@ class Primitive:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A link; `meshes` names shapes that are not primitives."""
+    """A link.
+
+    Attributes:
+        meshes: Names of visual shapes that are meshes.
+        unread: Names of collision shapes that are meshes, of a description that was read without its files.
+    """
 
     name: str
     collision: tuple[Primitive, ...]
     visual: tuple[Primitive, ...]
     meshes: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +164,8 @@ def _primitive(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Primit
 def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
     shapes = {tag: [(shape, _primitive(shape, colors)) for shape in element.findall(tag)] for tag in _SHAPE_TAGS}
     visual, collision = (tuple(one for _, one in found if one is not None) for found in shapes.values())
-    meshes = (shape.get("name", tag) for tag, found in shapes.items() for shape, one in found if one is None)
-    return Link(attribute(element, "name"), collision, visual, tuple(meshes))
+    meshes, unread = (tuple(s.get("name", s.tag) for s, one in found if one is None) for found in shapes.values())
+    return Link(attribute(element, "name"), collision, visual, meshes, unread)
 
 
 def _child(element: ET.Element, tag: str, key: str) -> str:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenes: a table in front of the robot and the objects on it.
 
-Positions are in the base frame (`world`, `openarm_body_link0`: x forward, y left, z up), metres; yaw is about z, rad.
-A scene is a YAML file in `models/scenes`, or drawn from a seed. One that does not fit is refused with all its faults.
+Positions are in the base frame (`world`: x forward, y left, z up), metres; yaw is about z, rad.
+A scene is a YAML file in `models/scenes`, or drawn from a seed; what it does not say of its table is as in the
+robot's folder. One that does not fit is refused with all its faults.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 from openarm_common.resources import is_file, models_dir
+from openarm_common.robot.folder import robot_name, robot_work
+from openarm_common.robot.work import Table
 from openarm_common.types import Array
 
 Rgba = tuple[float, float, float, float]
@@ -47,51 +50,9 @@ DENSITY = 700.0  # kg/m3, of an object without a mass: hard wood
 MAX_EDGE = 0.30  # m
 MIN_EDGE = 0.01  # m
 Edge = Annotated[float, Field(ge=MIN_EDGE, le=MAX_EDGE)]
-#: The front of the pedestal's column; a table that reaches further back would stand in it.
-_COLUMN_FRONT = 0.035
-#: Where an arm can grasp a cube of any yaw from above with a tilt up to 30°: x, and y to its own side.
-REGION_X = (0.16, 0.36)
-REGION_ABS_Y = (0.06, 0.42)
 #: Centre to centre in a random scene: the open fingers reach 65 mm to either side, an object up to 50 mm.
 SPACING = 0.12
 _TOUCH = 1e-4  # m; closer than this is touching, not overlapping
-
-
-class Table(Config):
-    """A table with four legs; its top is a box."""
-
-    top_z: float = Field(default=0.40, ge=0.05, le=1.2, description="height of the top, m")
-    x: tuple[float, float] = Field(default=(0.11, 0.81), description="front and back edge, m")
-    y: tuple[float, float] = Field(default=(-0.60, 0.60), description="right and left edge, m")
-    thickness: float = Field(default=0.04, gt=0.0, le=0.2, description="of the top, m")
-
-    @field_validator("x", "y")
-    @classmethod
-    def _ascending(cls, value: tuple[float, float]) -> tuple[float, float]:
-        if not value[0] < value[1]:
-            raise ValueError("expected [low, high] with low < high")
-        return value
-
-    @field_validator("x")
-    @classmethod
-    def _clear_of_pedestal(cls, value: tuple[float, float]) -> tuple[float, float]:
-        if value[0] < _COLUMN_FRONT:
-            raise ValueError(f"the front edge would stand in the pedestal; expected at least {_COLUMN_FRONT}")
-        return value
-
-    def at(self, height: float) -> Table:
-        """Return the same table with its top at another height, base frame, m."""
-        return self.model_copy(update={"top_z": height})
-
-    @property
-    def centre(self) -> tuple[float, float]:
-        """Middle of the top, m."""
-        return (self.x[0] + self.x[1]) / 2.0, (self.y[0] + self.y[1]) / 2.0
-
-    @property
-    def extents(self) -> tuple[float, float, float]:
-        """Edges of the top, m."""
-        return self.x[1] - self.x[0], self.y[1] - self.y[0], self.thickness
 
 
 class SceneObject(Config):
@@ -206,9 +167,22 @@ class Scene(Config):
     """A table, what is on it, and what is fixed somewhere."""
 
     name: str = Field(default="scene", min_length=1)
-    table: Table = Table()
+    table: Table = Field(default_factory=lambda: robot_work().table)
     objects: tuple[SceneObject, ...] = ()
     fixtures: tuple[Fixture, ...] = ()
+
+    @field_validator("table", mode="before")
+    @classmethod
+    def _completed(cls, value: Any) -> Any:
+        """What a scene does not say of its table is as in the folder of the robot."""
+        return {**robot_work().table.model_dump(), **value} if isinstance(value, Mapping) else value
+
+    @field_validator("table")
+    @classmethod
+    def _clear_of_the_robot(cls, value: Table) -> Table:
+        if fault := robot_work().fault_of(value):
+            raise ValueError(fault)
+        return value
 
     def object(self, name: str) -> SceneObject:
         """Return the object of that name.
@@ -267,7 +241,8 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
     """Read a scene.
 
     Args:
-        source: Name of a file in `models/scenes`, a path ending in .yaml, or "random".
+        source: Name of a file in `models/scenes` or in `scenes` of the robot's folder, which has precedence, a path
+            ending in .yaml, or "random".
         seed: Of a random scene.
 
     Raises:
@@ -275,17 +250,21 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
     """
     if source == "random":
         return random_scene(seed)
-    folder = models_dir() / "scenes"
     path = Path(source)
     if path.suffix not in (".yaml", ".yml"):
-        path = folder / f"{source}.yaml"
+        own, common = (folder / f"{source}.yaml" for folder in _folders())
+        path = own if is_file(own) else common
     if not is_file(path):
-        names = sorted(file.stem for file in folder.glob("*.yaml"))
+        names = sorted({file.stem for folder in _folders() for file in folder.glob("*.yaml")})
         raise OpenArmError(
             Code.SCENE_INVALID,
             f"no scene {brief(str(source))}; scenes: {', '.join([*names, 'random'])}, or the path of a YAML",
         )
     return parse_scene({"name": path.stem} | load_yaml(path, Code.SCENE_INVALID), str(path))
+
+
+def _folders() -> tuple[Path, Path]:
+    return models_dir() / "robots" / robot_name() / "scenes", models_dir() / "scenes"
 
 
 def random_scene(seed: int, count: int | None = None) -> Scene:
@@ -297,13 +276,13 @@ def random_scene(seed: int, count: int | None = None) -> Scene:
         seed: Same seed, same scene.
         count: How many objects; None draws it.
     """
-    rng = np.random.default_rng(seed)
+    rng, region = np.random.default_rng(seed), robot_work().region
     number = int(rng.integers(1, 5)) if count is None else count
     colors = rng.permutation(list(PALETTE))[:number]
     spots: list[Array] = []
     while len(spots) < number:
         side = rng.choice((-1.0, 1.0))
-        spot = np.array([rng.uniform(*REGION_X), side * rng.uniform(*REGION_ABS_Y)]).round(4)
+        spot = np.array([rng.uniform(*region.x), side * rng.uniform(*region.abs_y)]).round(4)
         if all(np.hypot(*(spot - other)) >= SPACING for other in spots):
             spots.append(spot)
     objects: list[SceneObject] = []

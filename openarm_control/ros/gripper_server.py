@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The action of a gripper controller, of either type that such controllers have.
 
-Both types move the driving finger joint: position in m from the middle (0 closed, 0.044 open), as the gripper
-controllers of ros2_control do; effort in N. The result of a gripper has no text, so an invalid goal is rejected and the
-reason logged.
+Both types move the driving finger joint, as the gripper controllers of ros2_control do: positions in m from the middle
+and efforts in N, or rad and N m where it is a hinge. The result of a gripper has no text, so an invalid goal is
+rejected and the reason logged.
 """
 
 from __future__ import annotations

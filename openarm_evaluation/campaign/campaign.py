@@ -22,6 +22,7 @@ from openarm_bringup.supervision import runs
 from openarm_common.config import load_json
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
+from openarm_common.robot.folder import DEFAULT
 from openarm_evaluation.campaign import cluster, report
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.parameters import suite_config
@@ -135,7 +136,7 @@ def read_rows(folder: Path, options: CampaignOptions) -> list[Row]:
     settings = options.settings()
     if kept.is_file():
         found = load_json(kept)
-        before: dict[str, Any] = found if isinstance(found, dict) else {}
+        before = {"robot": DEFAULT, **(found if isinstance(found, dict) else {})}  # older ones do not say it
         if before != settings:
             changed = ", ".join(
                 f"{key} was {brief(before.get(key))}" for key in settings if before.get(key) != settings[key]

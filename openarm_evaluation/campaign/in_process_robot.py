@@ -118,7 +118,7 @@ class InProcessRobot:
                 raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
             await self.robot.pause()
 
-    async def observe(self, count: int, *, near: bool = False) -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> Frames:
         """Frames that are taken from now on.
 
         Raises:
@@ -126,7 +126,7 @@ class InProcessRobot:
         """
         since_ns, robot = self.now_ns, self.robot
         config = self._config
-        robot.observe(config.near.camera if near else config.camera)
+        robot.observe(near or config.camera)
         robot.frames.clear()
         limit = config.near.timeout if near else config.detect.frame_timeout
 
@@ -142,7 +142,7 @@ class InProcessRobot:
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
         return Frames(tuple(fresh()[-count:]), self.base_frame)
 
-    def expect_near(self) -> None:
+    def expect_near(self, camera: str) -> None:
         """Nothing to wake: images are rendered when they are asked for."""
 
     def stop_observing(self) -> None:

@@ -19,16 +19,17 @@ import numpy as np
 
 from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.board.board_files import write_board
-from openarm_calibration.board.detect import detect
+from openarm_calibration.board.detect import BoardDetection, detect
 from openarm_calibration.handeye.offline import Result, calibrate
 from openarm_calibration.sampling.gate import Matched
 from openarm_calibration.sampling.next_pose import visible
 from openarm_calibration.sampling.samples import SampleSet, SessionHead
 from openarm_calibration.store.store import CalibrationStore
 from openarm_common import se3
-from openarm_common.camera.cameras import CameraConfig, load_cameras
+from openarm_common.camera.cameras import CameraConfig, load_cameras, uncertain_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import ArmParts, robot_work
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Array
 from openarm_evaluation.campaign.robot import shared_renderer
@@ -37,9 +38,12 @@ from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
 from openarm_sim_bridge.world.model import build_spec
 from openarm_sim_bridge.world.world import Snapshot, start_qpos
 
-#: The board between the fingers, for a fixed camera; and lying on the table, for one on the hand.
-_HELD = se3.make(se3.rotation_from_z_y((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.37))
-_PLACED = se3.make(se3.rotation_from_z_y((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)), (0.33, -0.2, 0.405))
+#: The board between the fingers, for a fixed camera: so far ahead of the tool centre point, m.
+_AHEAD, _HELD = 0.19, se3.rotation_from_z_y((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+#: And lying on the table, for one on the hand: before the far end of the region, to the side of its arm, m.
+_BEFORE, _ASIDE, _ABOVE = 0.03, 0.2, 0.005
+#: An arm whose shoulder is nearer to the middle is of neither side, m.
+_MIDDLE = 0.02
 _SAMPLES = 15
 _SPREAD = 0.4  # rad, of each joint around the middle of the postures
 _MAX_MISSED = 200
@@ -61,7 +65,8 @@ def with_mounts(
     store = CalibrationStore(folder / f"{seed}{robot}")
     zeros = drawn(hardware, RobotDescription.load()).zero
     mounts: dict[str, Array] = {}
-    for camera in (load_cameras()[name] for name in ("overhead", "wrist")):
+    cameras = load_cameras()
+    for camera in (cameras[name] for name in uncertain_cameras()):
         if store.find(camera.name) is None:
             store.save(calibrated(camera, seed, zeros).calibration)
         found = store.find(camera.name)
@@ -92,11 +97,16 @@ class Bench:
     def __init__(self, camera: CameraConfig, seed: int, folder: Path, zeros: Mapping[str, float] | None = None) -> None:
         self._zeros = zeros or {}
         self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load()
-        self._carrier = load_cameras()["wrist"].parent
-        self._fixed = camera.parent != self._carrier
-        posture = self._description.group_state
-        self._home = {**posture("right_arm", "home"), **posture("left_arm", "home")}
-        self._T_carrier_board, carrier = (_HELD, self._carrier) if self._fixed else (_PLACED, "")
+        moves = self._description.arm_of(camera.parent)
+        self._fixed = not moves
+        holder = self._description.arm(self._description.arm_names[-1])
+        self._carrier = camera.parent if moves else holder.flange
+        self._home: dict[str, float] = {}
+        for arm in self._description.arm_names:
+            hand = self._description.hand(arm)  # fingers that are open hide less from a camera behind them
+            self._home |= self._description.group_state(f"{arm}_arm", "home") | {hand.joint: hand.opened}
+        carrier = self._carrier if self._fixed else ""
+        self._T_carrier_board = self._in_hand(holder) if self._fixed else self._on_table(moves)
         write_board(self._board, folder / "board.xml")
         spec = build_spec(self._description, load_scene("empty"), load_cameras(), seed)
         child = mujoco.MjSpec.from_file(str(folder / "board.xml"))
@@ -120,6 +130,22 @@ class Bench:
         )
         self.samples = SampleSet(head, self._description)
 
+    def _in_hand(self, arm: ArmParts) -> Array:
+        """Where an arm holds the board, frame of its flange, (4, 4)."""
+        zero = dict.fromkeys(self._description.joints, 0.0)
+        T_root_flange, T_root_tcp = (self._description.link_pose(link, zero) for link in (arm.flange, arm.tcp))
+        T_flange_tcp = se3.inverse(T_root_flange) @ T_root_tcp
+        T_flange_board = T_flange_tcp @ se3.make(_HELD, (0.0, 0.0, _AHEAD))
+        return se3.make(T_flange_board[:3, :3], T_flange_board[:3, 3].round(3))
+
+    def _on_table(self, arm: str) -> Array:
+        """Where the board lies for the camera on the hand of an arm, (4, 4)."""
+        work = robot_work()
+        shoulder = float(self._description.link_pose(self._description.arm(arm).base, {})[1, 3])
+        y = np.sign(shoulder) * _ASIDE if abs(shoulder) > _MIDDLE else 0.0
+        place = (round(work.region.x[1] - _BEFORE, 3), y, round(work.table.top_z + _ABOVE, 3))
+        return se3.make(se3.rotation_from_z_y((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)), place)
+
     def fill(self, rng: np.random.Generator, count: int = _SAMPLES) -> None:
         """Take `count` samples.
 
@@ -133,12 +159,8 @@ class Bench:
             joints = self._joints(np.clip(middle + rng.uniform(-_SPREAD, _SPREAD, len(middle)), lower, upper))
             if not self._visible(joints) or not self._free(joints):
                 continue
-            renderer = shared_renderer()
-            renderer.load(Snapshot(self._model, 0, self._data.qpos.copy()))
-            renderer.draw(self._camera.name, self._picture)
             try:
-                grey = np.asarray(cv2.cvtColor(self._picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-                found = detect(self._board, grey)
+                found = self._look()
             except OpenArmError:
                 missed += 1
                 if missed > _MAX_MISSED:
@@ -147,20 +169,40 @@ class Bench:
             reported = {name: q + self._zeros.get(name, 0.0) for name, q in joints.items()}
             self.samples.take(0, Matched(reported, 0, 0.0), found)
 
-    def _middle(self, tries: int = 3000) -> Array:
-        """Joint positions around which most postures show the board."""
+    def _look(self) -> BoardDetection:
+        """What the camera finds in the posture that was last tried; raises as `detect`."""
+        renderer = shared_renderer()
+        renderer.load(Snapshot(self._model, 0, self._data.qpos.copy()))
+        renderer.draw(self._camera.name, self._picture)
+        grey = np.asarray(cv2.cvtColor(self._picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        return detect(self._board, grey)
+
+    def _middle(self, tries: int = 30_000, enough: int = 40) -> Array:
+        """Joint positions around which most postures show the board, itself one where nothing hides it.
+
+        Raises:
+            OpenArmError: NOTHING_DETECTED, when there is none.
+        """
         rng = np.random.default_rng(0)
         lower, upper = self._description.limits(self.samples.joint_names)
-        best, most = lower, 0
+        found = list[tuple[int, Array]]()
         for _ in range(tries):
             q = rng.uniform(lower + 0.1, upper - 0.1)
-            if not self._visible(self._joints(q)):
+            if len(found) == enough:
+                break
+            if not self._visible(self._joints(q)) or not self._free(self._joints(q)):
                 continue
             near = np.clip(q + rng.uniform(-_SPREAD, _SPREAD, (20, len(q))), lower, upper)
-            count = sum(self._visible(self._joints(k)) for k in near) if self._free(self._joints(q)) else 0
-            if count > most:
-                best, most = q, count
-        return best
+            found.append((sum(self._visible(self._joints(k)) for k in near), q))
+        for _, q in sorted(found, key=lambda one: -one[0]):
+            self._free(self._joints(q))
+            try:
+                self._look()
+            except OpenArmError:
+                continue
+            return q
+        text = f"none of {tries} postures shows the board to camera {self._camera.name!r}"
+        raise OpenArmError(Code.NOTHING_DETECTED, text)
 
     def _visible(self, joints: dict[str, float]) -> bool:
         hand = self._description.link_pose(self._carrier, joints)

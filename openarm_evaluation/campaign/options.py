@@ -11,7 +11,10 @@ from typing import Annotated, Any, get_args
 from cyclopts import Parameter, Token
 from cyclopts.validators import Number
 
+from openarm_bringup.commands.connect import Robot
+from openarm_common.camera.cameras import detector_nodes
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import DEFAULT, robot_name
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_sim_bridge.config import FaceName, Profile
 
@@ -85,11 +88,13 @@ class CampaignOptions:
     detector: DetectorKind = "color"
     parameters: Annotated[tuple[str, ...], Parameter(name="--set")] = ()
     ray: str = ""
+    robot: Robot = None
 
     def settings(self) -> dict[str, Any]:
         """What must be the same for rows to belong together."""
         return {
             "set": self.set_name,
+            "robot": robot_name(),
             "noise": self.noise,
             "mount_seeds": list(self.mount_seeds),
             **self._profile_settings(),
@@ -111,7 +116,7 @@ class CampaignOptions:
             f"mujoco_bridge.depth_noise.enabled={str(self.noise).lower()}",
             f"mujoco_bridge.profile={self.profile}",
             f"grasp.held.use_effort={str(self.use_effort and self.controllers == 'suite').lower()}",
-            *(f"{node}.detector={self.detector}" for node in ("detector", "wrist_detector")),
+            *(f"{node}.detector={self.detector}" for node in detector_nodes().values()),
             *self.parameters,
         )
 
@@ -121,6 +126,7 @@ class CampaignOptions:
             "./openarm campaign",
             f"--suite {self.set_name}" if self.set_name != "nominal" else "",
             f"--seeds {seed}",
+            f"--robot {robot_name()}" if robot_name() != DEFAULT else "",
         ]
         parts.append("--noise" if self.noise else "")
         parts.append("--mount-seeds " + ",".join(map(str, self.mount_seeds)) if self.mount_seeds else "")

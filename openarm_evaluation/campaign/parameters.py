@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 
 from openarm_bringup.supervision.graph import load_graph
+from openarm_common.camera.cameras import detector_nodes
+from openarm_common.robot.folder import per_robot
 from openarm_grasp.config import GraspConfig
 from openarm_motion.config import MotionConfig
 from openarm_octomap.config import OctomapNodeConfig
@@ -26,7 +27,7 @@ class SuiteConfig:
     grasp: GraspConfig
 
 
-@cache
+@per_robot
 def suite_config(sets: tuple[str, ...] = ()) -> SuiteConfig:
     """Read the parameters of the graph `sim`.
 
@@ -37,7 +38,7 @@ def suite_config(sets: tuple[str, ...] = ()) -> SuiteConfig:
         OpenArmError: INVALID_ARGUMENT or CONFIG_INVALID, for a fault in `sets`.
     """
     graph = load_graph("sim", sets=sets)
-    detectors = [graph.config(node, DetectNodeConfig) for node in ("detector", "wrist_detector")]
+    detectors = [graph.config(node, DetectNodeConfig) for node in detector_nodes().values()]
     return SuiteConfig(
         bridge=graph.config("mujoco_bridge", BridgeConfig),
         detectors={config.camera: config for config in detectors},

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from openarm_common.camera.cameras import spectator_camera, table_camera
 from openarm_common.errors import OpenArmError
 from openarm_common.octree.codec import write_file
 from openarm_evaluation.campaign.robot import SimRobot
 from openarm_octomap.config import GridConfig
 from openarm_octomap.grid import DepthScan, OccupancyGrid
 
-_VIEWS = ("overhead", "spectator")
 _PICTURES = 6
 
 
@@ -45,16 +45,18 @@ class Keeper:
         self._pictures: list[tuple[str, NDArray[np.uint8]]] = []
         self._scan: DepthScan | None = None
         self._failed = False
+        #: Cameras that take the pictures: over the table, and for people.
+        self._views = tuple(dict.fromkeys((table_camera(), spectator_camera())))
 
     def step(self, state: str, *, failed: bool) -> None:
         """Note a transition; the first one after a failure is photographed."""
         if failed and not self._failed and len(self._pictures) < _PICTURES:
-            self._shoot(f"failed_{len(self._pictures) // len(_VIEWS)}_{state.lower()}")
+            self._shoot(f"failed_{len(self._pictures) // len(self._views)}_{state.lower()}")
         self._failed = failed
-        seen = self._robot.images.get("overhead")
+        seen = self._robot.images.get(table_camera())
         if state == "TRANSFORM" and seen is not None:
             t_ns, _, depth = seen
-            camera = self._robot.cameras["overhead"]
+            camera = self._robot.cameras[table_camera()]
             T_base_camera = self._robot.camera_pose(camera, t_ns)
             self._scan = DepthScan(depth.copy(), camera.intrinsics, T_base_camera, camera.near, camera.far)
 
@@ -69,7 +71,7 @@ class Keeper:
             np.savez_compressed(folder / "cloud.npz", points_base=self._scan.points())
             grid = OccupancyGrid(GridConfig())
             grid.integrate([self._scan], 0)
-            write_file(folder / "map.bt", grid.binary(), grid.lattice.resolution)
+            write_file(folder / "map.bt", grid.binary(), grid.lattice.resolution, self._robot.description.name)
         t_ns, position, effort = map(np.array, zip(*self._robot.trace, strict=True))
         names = np.array(self._robot.world.joint_names)
         np.savez_compressed(folder / "joints.npz", joint_names=names, t_ns=t_ns, position=position, effort=effort)
@@ -77,7 +79,7 @@ class Keeper:
         return folder
 
     def _shoot(self, name: str) -> None:
-        for view in _VIEWS:
+        for view in self._views:
             try:
                 self._pictures.append((f"{name}_{view}", self._robot.draw(view)[0].copy()))
             except OpenArmError:

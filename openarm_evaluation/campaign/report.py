@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from openarm_common.camera.cameras import spectator_camera
 from openarm_common.figures import render_page
 from openarm_evaluation.judging.statistics import interval, rate_of, spread
 
@@ -154,5 +155,5 @@ def write_html(path: Path, data: Mapping[str, Any]) -> None:
 def _pictures(campaign: Path, folder: str) -> list[str]:
     """Return the spectator's pictures at each failure and at the end, relative to the campaign's folder."""
     names = ("failed*", "end")
-    found = (path for name in names for path in sorted((campaign / folder).glob(f"{name}_spectator.png")))
+    found = (path for name in names for path in sorted((campaign / folder).glob(f"{name}_{spectator_camera()}.png")))
     return [f"{folder}/{path.name}" for path in found]

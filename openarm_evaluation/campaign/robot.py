@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Generator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from types import coroutine
 from typing import TypeVar
@@ -20,16 +19,18 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from openarm_common import se3
-from openarm_common.camera.cameras import CameraConfig, load_cameras
+from openarm_common.camera.cameras import CameraConfig, detector_nodes, load_cameras
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.config import Config, load_config
 from openarm_common.errors import OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import per_robot
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.robot.servos import ServoModel
-from openarm_common.scene.scene import Scene, Table
+from openarm_common.robot.work import Table
+from openarm_common.scene.scene import Scene
 from openarm_common.types import Array
 from openarm_control.arm import End, TrajectoryFollower, TrajectoryOutcome
 from openarm_control.trajectory import Trajectory as FollowedTrajectory
@@ -80,7 +81,7 @@ class SimulatedSenses(Config):
     def parameters(self) -> tuple[str, ...]:
         """Return all of it as parameters of nodes."""
         noise = f"mujoco_bridge.depth_noise.enabled={str(self.depth_noise).lower()}"
-        return (noise, *(f"{node}.detector={self.detector}" for node in ("detector", "wrist_detector")), *self.sets)
+        return (noise, *(f"{node}.detector={self.detector}" for node in detector_nodes().values()), *self.sets)
 
 
 @coroutine
@@ -370,7 +371,7 @@ class SimRobot:
         return [self.world.joint_names.index(name) for name in names]
 
 
-@cache
+@per_robot
 def shared_renderer() -> SnapshotRenderer:
     """One renderer a process; it takes every model."""
     return SnapshotRenderer(load_cameras())
@@ -420,18 +421,18 @@ def arms_behind(sets: tuple[str, ...], table: Table) -> Mapping[str, Arm]:
     return _arms(motion.model_dump_json(), table.model_dump_json())
 
 
-@cache
+@per_robot
 def _arms(config: str, table: str) -> Mapping[str, Arm]:
     fixed = (table_box(Table.model_validate_json(table)),)
     return make_arms(MotionConfig.model_validate_json(config), RobotDescription.load(), fixed)
 
 
-@cache
+@per_robot
 def _finder(sets: tuple[str, ...], camera: str) -> RobotFinder:
     return RobotFinder(RobotDescription.load(), suite_config(sets).detectors[camera].self_filter)
 
 
-@cache
+@per_robot
 def _pipeline(sets: tuple[str, ...], name: str, table_z: float) -> Pipeline:
     config, camera = suite_config(sets).detectors[name], load_cameras()[name]
     path = Path(config.colors) if config.colors else config_dir() / "params" / "detector.yaml"

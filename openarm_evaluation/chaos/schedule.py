@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from openarm_common.camera.cameras import depth_cameras, detector_nodes
 from openarm_common.errors import Code, OpenArmError
 
 #: Kinds of faults and what each does.
@@ -77,7 +78,7 @@ class Round:
     Attributes:
         number: From 0.
         pick: Number that chooses one of the objects on the table.
-        arm: auto, left or right.
+        arm: auto, or an arm of the robot.
         worded: Ask by color and shape, not by the label.
         fault: None: nothing goes wrong.
     """
@@ -130,12 +131,13 @@ def _fault(rng: np.random.Generator, bags: Mapping[str, Iterator[str]]) -> Fault
         return Fault(kind, when, after, 0.0 if kind == "kill" else seconds, node=next(bags[kind]))
     if kind == "camera":
         name, parameters = _CAMERA_FAULTS[int(rng.integers(len(_CAMERA_FAULTS)))]
-        camera = ("overhead", "wrist")[int(rng.integers(2))]
+        cameras = tuple(depth_cameras())
+        camera = cameras[int(rng.integers(len(cameras)))]
         return Fault(kind, when, after, seconds, injected=(name, {"camera": camera, **parameters}))
     if kind == "joints":
         return Fault(kind, when, after, seconds, injected=("joint_state_gap", {"ms": int(rng.integers(50, 400))}))
     if kind in ("detector", "plans"):
-        names = ("detector", "wrist_detector") if kind == "detector" else ("motion",)
+        names = tuple(detector_nodes().values()) if kind == "detector" else ("motion",)
         parameter = "faults.miss_share" if kind == "detector" else "faults.no_plan_share"
         node, share = names[int(rng.integers(len(names)))], (0.5, 1.0)[int(rng.integers(2))]
         return Fault(kind, when, after, seconds, node, share=(parameter, share))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import choose_robot
 from openarm_evaluation.campaign.options import CampaignOptions, Detectors
 
 DEFAULTS = CampaignOptions()
@@ -36,6 +37,7 @@ def campaign(
         out: Folder of the campaign; a new one below runs/ when not given.
         accept: Share of scenes that must go as expected.
     """
+    choose_robot(options.robot)
     from openarm_bringup.supervision import runs
     from openarm_evaluation.campaign.agree import compare, rows_of, text_of
     from openarm_evaluation.campaign.campaign import Campaign, joined, run_campaign

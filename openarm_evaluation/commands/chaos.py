@@ -7,8 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from openarm_bringup.commands.connect import Robot
 from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code
+from openarm_common.robot.folder import choose_robot, robot_name
 
 
 def chaos(
@@ -19,6 +21,7 @@ def chaos(
     rounds: int | None = None,
     plot: Path | None = None,
     out: Path | None = None,
+    robot: Robot = None,
 ) -> Outcome:
     """Pick objects on a graph of its own while a seeded schedule of faults runs, and hold what must never happen.
 
@@ -36,6 +39,7 @@ def chaos(
         plot: PNG of the memory, descriptors and threads of each node over time.
         out: Folder for logs, report and memory; a new one below runs/ when not given.
     """
+    choose_robot(robot)
     from openarm_bringup.supervision import runs
     from openarm_evaluation.chaos.ros.actors import mount_small
     from openarm_evaluation.chaos.ros.runner import run
@@ -59,6 +63,7 @@ def chaos(
     uses = report.usage.uses if report.usage else []
     found = {
         "folder": str(folder),
+        "robot": robot_name(),
         "seed": seed,
         "seconds": report.seconds,
         "requests": len(report.rounds),

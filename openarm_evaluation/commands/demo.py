@@ -6,8 +6,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from openarm_bringup.commands.connect import check_arms
 from openarm_bringup.outcome import GraphReport, Outcome
 from openarm_common.errors import Code
+from openarm_common.robot.folder import choose_robot
 from openarm_evaluation.demo.options import DemoOptions
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ def demo(*, options: DemoOptions = DEFAULTS, accept: float = 0.9) -> Outcome:
     Args:
         accept: With seeds: the share of objects placed that counts as success.
     """
+    choose_robot(options.robot)
+    check_arms(options.arm)
     from openarm_evaluation.demo.demo import Listeners, run_demo
 
     show = _Show(quiet_steps=bool(options.seeds))

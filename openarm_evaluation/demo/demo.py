@@ -14,6 +14,7 @@ from openarm_bringup.supervision.graph import Graph, load_graph
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import OpenArmError
+from openarm_common.robot.folder import robot_name
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.demo import mounts
 from openarm_evaluation.demo.options import DemoOptions
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from openarm_bringup.supervision.supervisor import Event
     from openarm_evaluation.judging.ros.observer import Observer
 
-SPECTATOR = "/spectator/color/image_raw"
 DETECTION = "/detection_image"
 
 
@@ -128,20 +128,21 @@ class Studio:
     """Takes the pictures of a run: before, what was detected, held, after; and a film of all of it."""
 
     def __init__(self, result: DemoResult, observer: Observer) -> None:
-        from openarm_common.camera.cameras import load_cameras
+        from openarm_common.camera.cameras import load_cameras, spectator_camera
         from openarm_evaluation.judging.film import Film
 
         self._result = result
         self._folder = result.run_dir
-        self._film = Film(result.run_dir / "grasp.mp4", load_cameras()["spectator"].rate)
+        camera = load_cameras()[spectator_camera()]
+        self._film, self._view = Film(result.run_dir / "grasp.mp4", camera.rate), f"/{camera.name}/color/image_raw"
         self._observer = observer
         self._filming = False
 
     def begin(self) -> None:
         """Start filming and take the picture before; called in the thread of the trials."""
         self._filming = True
-        self._observer.watch_camera(SPECTATOR, self._film.add)
-        self._save_next(SPECTATOR, "before.png")
+        self._observer.watch_camera(self._view, self._film.add)
+        self._save_next(self._view, "before.png")
         self._observer.watch_camera(DETECTION)
         self._save_next(DETECTION, "detection.png")
         self._observer.unwatch_camera(DETECTION)
@@ -155,7 +156,7 @@ class Studio:
         """Take the last picture and finish the film."""
         if self._filming:
             self._save_newest("after.png")
-            self._observer.unwatch_camera(SPECTATOR)
+            self._observer.unwatch_camera(self._view)
         if self._film.close():
             self._result.pictures.append("grasp.mp4")
         if self._film.save_animation(self._folder / "grasp.webp"):
@@ -170,9 +171,9 @@ class Studio:
             self._result.warnings.append(f"{name}: {error.message}")
 
     def _save_newest(self, name: str) -> None:
-        frame = self._observer.frame(SPECTATOR)
+        frame = self._observer.frame(self._view)
         if frame is None:
-            self._result.warnings.append(f"{name}: no image of {SPECTATOR}")
+            self._result.warnings.append(f"{name}: no image of {self._view}")
         else:
             self._save(name, frame[1])
 
@@ -188,6 +189,7 @@ def write_report(options: DemoOptions, graph: Graph, result: DemoResult) -> dict
     rows = [trial.as_row() for trial in result.trials]
     data: dict[str, Any] = {
         "graph": graph.name,
+        "robot": robot_name(),
         "domain": graph.domain,
         "mount_seed": graph.mount_seed,
         "mounts": result.mounts,

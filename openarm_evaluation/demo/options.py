@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from openarm_bringup.commands.connect import Arm, Sets
+from openarm_bringup.commands.connect import Robot, Sets
 from openarm_evaluation.campaign.options import Seeds
 
 
@@ -33,7 +33,7 @@ class DemoOptions:
 
     seeds: Seeds = ()
     label: str | None = None
-    arm: Arm = "auto"
+    arm: str = "auto"
     place: tuple[float, float, float] | None = None
     scene: str | None = None
     graph: str = "sim"
@@ -42,6 +42,7 @@ class DemoOptions:
     mount_seed: str | None = None
     uncalibrated: bool = False
     domain: int | None = None
+    robot: Robot = None
 
     @property
     def film(self) -> bool:

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
+from openarm_common.camera.cameras import CameraConfig, Intrinsics, hand_cameras, load_cameras, table_camera
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.scene import SHAPES, Scene, SceneObject, Table
+from openarm_common.robot.folder import robot_work
+from openarm_common.scene.scene import SHAPES, Scene, SceneObject
 from openarm_common.types import Array
 from openarm_evaluation.detector.appearance import colour, draw_shape, pattern, sensor, surface
 from openarm_sim_bridge.cameras.renderer import create_gl_context
@@ -28,14 +29,16 @@ from openarm_sim_bridge.world.world import start_qpos
 
 Rng = np.random.Generator
 
-#: Views and how often each is taken.
-VIEWS = {"overhead": 0.65, "wrist": 0.35}
+#: Share of the views that are taken from hands.
+_FROM_HANDS = 0.35
 #: Share of pictures for which no object is drawn.
 EMPTY = 0.15
 _SLOTS = {"box": 5, "cylinder": 5, "sphere": 4}
 _SHEETS, _BARS, _TEXTURES = 3, 3, 9
 #: An object is labelled when this share of its silhouette and this many pixels are visible.
 _SEEN, _PIXELS = 0.35, 150
+#: From the front, back and side edges of the table to the middle of what lies on it, m.
+_NEAR_EDGE, _FAR_EDGE, _SIDE_EDGE = 0.03, 0.16, 0.1
 _AWAY = (0.0, 0.0, -8.0)
 
 
@@ -73,12 +76,17 @@ class RandomViews:
     def __init__(self) -> None:
         self._description = RobotDescription.load()
         self._cameras = load_cameras()
-        self._table = Table()
+        self._table = robot_work().table
         self._model = self._compile()
         self._data = mujoco.MjData(self._model)
-        size = {(self._cameras[name].width, self._cameras[name].height) for name in VIEWS}
+        self._on_hands = hand_cameras()
+        share = _FROM_HANDS / max(len(self._on_hands), 1)
+        above = {table_camera(): 1.0 - _FROM_HANDS * bool(self._on_hands)} if table_camera() else {}
+        self._views = above | dict.fromkeys(self._on_hands, share)
+        size = {(self._cameras[name].width, self._cameras[name].height) for name in self._views}
         if len(size) != 1:
-            raise OpenArmError(Code.CONFIG_INVALID, f"cameras {', '.join(VIEWS)} have different sizes: {sorted(size)}")
+            names = ", ".join(self._views) or "none"
+            raise OpenArmError(Code.CONFIG_INVALID, f"expected cameras of one size, got {names}: {sorted(size)}")
         self._gl = create_gl_context(*next(iter(size)))
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -93,7 +101,7 @@ class RandomViews:
 
     def draw(self, rng: Rng) -> Picture:
         """Draw one picture; the same state of the generator gives the same picture."""
-        name = str(rng.choice(list(VIEWS), p=list(VIEWS.values())))
+        name = str(rng.choice(list(self._views), p=list(self._views.values())))
         camera = self._cameras[name]
         self._light(rng)
         self._surfaces(rng)
@@ -176,7 +184,8 @@ class RandomViews:
             state = description.group_state(f"{side}_arm", "wrist_look" if observes else "home")
             spread = 0.10 if observes else 0.05 if rng.random() < 0.55 else 0.5
             joints |= {name: state[name] + float(rng.normal(0.0, spread)) for name in description.arm_joints(side)}
-            joints[description.finger_joint(side)] = float(rng.uniform(0.0, 0.044))
+            hand = description.hand(side)
+            joints[hand.joint] = hand.position(float(rng.uniform(0.0, hand.parts.opening)))
         self._data.qpos[:] = start_qpos(self._model, joints)
 
     def _mount(self, rng: Rng, camera: CameraConfig) -> None:
@@ -218,7 +227,9 @@ class RandomViews:
             self._data.mocap_quat[slot] = np.roll(se3.quat_xyzw_from_matrix(turn), 1)
 
     def _spot(self, rng: Rng) -> tuple[float, float]:
-        return float(rng.uniform(0.14, 0.65)), float(rng.uniform(-0.5, 0.5))
+        (front, back), (right, left) = self._table.x, self._table.y
+        x = rng.uniform(round(front + _NEAR_EDGE, 3), round(back - _FAR_EDGE, 3))
+        return float(x), float(rng.uniform(round(right + _SIDE_EDGE, 3), round(left - _SIDE_EDGE, 3)))
 
     # --- objects
     def _fill(self, rng: Rng, view: str, lens: Intrinsics, T_world_optical: Array) -> list[_Placed]:
@@ -235,7 +246,7 @@ class RandomViews:
             kind = str(rng.choice(list(_SLOTS)))
             half, R = draw_shape(rng, kind)
             reach = float(np.hypot(*(np.abs(R[:2]) @ half))) if kind == "box" else float((np.abs(R[:2]) @ half).max())
-            spot = self._free_spot(rng, reach, taken, lens, T_world_optical, inside=view == "wrist")
+            spot = self._free_spot(rng, reach, taken, lens, T_world_optical, inside=view in self._on_hands)
             if spot is None or used[kind] == _SLOTS[kind]:
                 continue
             taken.append((*spot, reach))

@@ -29,11 +29,12 @@ class HandReader:
     def __init__(self, description: RobotDescription, states: RobotStateBuffer, arm: str) -> None:
         self._description = description
         self._states = states
-        self.joint = description.finger_joint(arm)
+        self.hand = description.hand(arm)
+        self.joint = self.hand.joint
         self._tcp = description.tcp_link(arm)
 
     def finger(self) -> float:
-        """Position of one finger, m; 0 is closed.
+        """Distance of a pad from the middle of the hand, m; 0 is closed.
 
         Raises:
             OpenArmError: NOT_READY, when there is no joint state, or none of the finger.
@@ -65,19 +66,19 @@ class HandReader:
 
         Args:
             expected: Width of the object between the fingers, m.
-            effort: Of the finger joint, N.
+            effort: Of the finger joint, N or N m.
             T_base_planned: (4, 4) where the TCP should be; None leaves its error 0.
             pads: Force on each finger pad, N; empty without a sensor.
         """
         error = 0.0
         if T_base_planned is not None:
             error = float(np.linalg.norm(self.T_base_tcp()[:3, 3] - T_base_planned[:3, 3]))
-        return Evidence(self.gap(), expected, effort, self.gap_speed(), error, pads)
+        return Evidence(self.gap(), expected, effort / abs(self.hand.lever), self.gap_speed(), error, pads)
 
     def _finger_in(self, q: Mapping[str, float]) -> float:
         if self.joint not in q:
             raise OpenArmError(Code.NOT_READY, f"/joint_states has no {self.joint}; it has {', '.join(sorted(q))}")
-        return q[self.joint]
+        return self.hand.finger(q[self.joint])
 
 
 class Silence:

@@ -20,8 +20,9 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
-from openarm_grasp.config import ApproachConfig, GraspConfig, HandConfig
+from openarm_grasp.config import ApproachConfig, GraspConfig
 
 UP = np.array([0.0, 0.0, 1.0])
 #: A tilt of 15° costs more than width and side together can win back.
@@ -103,7 +104,12 @@ class PlaceTarget:
         return "{} at ({:.3f}, {:.3f}) m".format(self.id, *self.position[:2])
 
 
-def tcp_height(height: float, tilt: float, hand: HandConfig) -> float:
+def tips_height(tilt: float, hand: HandParts) -> float:
+    """Height of the TCP above a surface at which the finger tips clear it, m; tilt in rad."""
+    return hand.tip_clearance + hand.tip_clearance_tilted * sin(tilt)
+
+
+def tcp_height(height: float, tilt: float, hand: HandParts) -> float:
     """Height of the TCP above the surface the object stands on, m.
 
     The largest of three: the finger tips clear the surface, the pads meet the object's middle, the palm clears its top.
@@ -113,7 +119,7 @@ def tcp_height(height: float, tilt: float, hand: HandConfig) -> float:
         tilt: Of the approach from straight down, rad.
         hand: Measures of the gripper.
     """
-    tips = hand.tip_clearance + hand.tip_clearance_tilted * sin(tilt)
+    tips = tips_height(tilt, hand)
     pads = height / 2.0 - hand.pad_centre
     palm = height - hand.palm_depth + hand.palm_depth_tilted * sin(tilt)
     return max(tips, pads, palm)
@@ -157,6 +163,7 @@ def _fits(width: float, limits: ApproachConfig) -> bool:
 def propose(
     target: Detection,
     config: GraspConfig,
+    hand: HandParts,
     *,
     shoulder_xy: Sequence[float] = (0.0, 0.0),
     others: Sequence[Detection] = (),
@@ -167,6 +174,7 @@ def propose(
     Args:
         target: The object; its lower face is the surface it stands on.
         config: Parameters.
+        hand: Measures of the gripper.
         shoulder_xy: (2,) of the arm's shoulder in the base frame, m; leaning away from it reaches furthest.
         others: What stands around it; hands whose fingers have room come first.
         raised: TCP so much higher than it need be, m; nothing is proposed where the pads would leave the object.
@@ -177,13 +185,13 @@ def propose(
     found: list[GraspCandidate] = []
     height = float(target.size[2])
     for edge, direction, width in graspable_edges(target, config.approach):
-        room = _room(target.p_base, direction, others, config.hand)
+        room = _room(target.p_base, direction, others, hand)
         for flip, tilt_deg, lean in product(("+", "-"), config.approach.tilts_deg, ("+", "-")):
             if tilt_deg == 0.0 and lean == "-":
                 continue  # a vertical hand leans nowhere
             tilt = radians(tilt_deg)
-            above = tcp_height(height, tilt, config.hand) + raised
-            if raised and above + config.hand.pad_centre > height:
+            above = tcp_height(height, tilt, hand) + raised
+            if raised and above + hand.pad_centre > height:
                 continue
             name = f"{target.label}/{edge}{flip}/tilt{tilt_deg:g}" + (f"/lean{lean}" if tilt_deg else "")
             name += f"/up{raised * 1e3:g}" if raised else ""
@@ -192,6 +200,7 @@ def propose(
             z_tool = sin(tilt) * heading - cos(tilt) * UP
             p = target.p_base.copy()
             p[2] = target.bottom + above
+            p -= hand.tcp_shift(0.5 * width) * z_tool
             parts = {
                 "tilt": -_TILT_COST_PER_RAD * tilt,
                 "width": _WIDTH_WEIGHT * max(0.0, 1.0 - width / config.approach.max_width),
@@ -226,7 +235,7 @@ def _outward(p_base: Array, heading: Array, shoulder_xy: Sequence[float]) -> flo
     return (float(heading[0]) * x + float(heading[1]) * y) / distance if distance > 1e-6 else 0.0
 
 
-def _room(p_base: Array, direction: Array, others: Sequence[Detection], hand: HandConfig) -> float:
+def _room(p_base: Array, direction: Array, others: Sequence[Detection], hand: HandParts) -> float:
     """Least distance between an open finger and what stands around, seen from above, m; negative: it does not fit."""
     least = np.inf
     for side in (1.0, -1.0):

@@ -72,7 +72,8 @@ class FeasibilityCheck:
 
     def _offered(self, arm: str, found: Sighting) -> tuple[GraspCandidate, ...]:
         shoulder = self._context.shoulders.get(arm, (0.0, 0.0))
-        return propose(found.target, self._context.config, shoulder_xy=shoulder, others=found.others)
+        context = self._context
+        return propose(found.target, context.config, context.hand, shoulder_xy=shoulder, others=found.others)
 
     async def pick_and_place(
         self,

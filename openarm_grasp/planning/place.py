@@ -17,7 +17,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene.scene import Table
+from openarm_common.robot.work import Table
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig, PlaceConfig
 from openarm_grasp.evidence.verdicts import SQUARE_WITHIN

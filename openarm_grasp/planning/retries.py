@@ -17,6 +17,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code
+from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import GraspCandidate, propose
@@ -74,6 +75,7 @@ class Ways:
 def ways(
     target: Detection,
     config: GraspConfig,
+    hand: HandParts,
     failed: Sequence[FailedGrasp],
     *,
     shoulder_xy: Sequence[float] = (0.0, 0.0),
@@ -87,6 +89,7 @@ def ways(
     Args:
         target: The object as it is seen now.
         config: Parameters.
+        hand: Measures of the gripper.
         failed: What has failed so far.
         shoulder_xy: As of `propose`.
         others: As of `propose`.
@@ -95,11 +98,11 @@ def ways(
         OpenArmError: TOO_WIDE, when no side fits into the hand.
     """
     if not failed:
-        return Ways(propose(target, config, shoulder_xy=shoulder_xy, others=others), ())
+        return Ways(propose(target, config, hand, shoulder_xy=shoulder_xy, others=others), ())
     after_collision = any(one.code is Code.HAND_COLLISION for one in failed)
     ranked: list[GraspCandidate] = []
     for raised in (0.0, RAISE):
-        for one in propose(target, config, shoulder_xy=shoulder_xy, others=others, raised=raised):
+        for one in propose(target, config, hand, shoulder_xy=shoulder_xy, others=others, raised=raised):
             score = _SAME_SIDES * max(past.sides(one) for past in failed)
             if raised:
                 score += _RAISED_AFTER_COLLISION if after_collision else _RAISED

@@ -16,9 +16,8 @@ from typing import Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from openarm_common.config import Config, load_config
+from openarm_common.config import Config, Interval, load_config
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.config import Interval
 from openarm_grasp.requests.request import GraspRequest
 
 #: (x, y), base frame, m.

@@ -94,8 +94,7 @@ class GraspSession:
 
     def partly_open(self, robot: Skills, arm: str) -> bool:
         """Whether the fingers are neither closed on nothing nor wide open, so that something may be between them."""
-        hand, aperture = self.context.config.hand, robot.aperture(arm)
-        return self.context.config.held.closed_below < aperture < 2.0 * (hand.opening - hand.open_tolerance)
+        return self.context.config.held.closed_below < robot.aperture(arm) and not robot.is_open(arm)
 
     async def release(self, robot: Skills, arm: str) -> str:
         """Open a hand where it is, and forget what it held; return what was done, in a sentence.
@@ -119,7 +118,7 @@ class GraspSession:
                 else "no hand holds anything",
             )
         arm = arm or holding[0]
-        await robot.grip(arm, self.context.config.hand.opening, "release")
+        await robot.open(arm, "release")
         kept = self.kept.pop(arm, None)
         return f"the {arm} hand is open" + (f"; it held {kept.sighting.target.label!r}" if kept else "")
 

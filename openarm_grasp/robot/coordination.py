@@ -72,7 +72,7 @@ class CoordinatedRobot:
         self._robot.warn(f"{self.arm} arm: {text}")
 
     # --- observing
-    async def observe(self, count: int, *, near: bool = False) -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> Frames:
         """Frames that are taken from now on.
 
         An arm that observes from home (what it is to grasp, or has placed) waits until the other one hides nothing any
@@ -91,9 +91,9 @@ class CoordinatedRobot:
             coordination.observing = ""
             self._robot.stop_observing()
 
-    def expect_near(self) -> None:
+    def expect_near(self, camera: str) -> None:
         """Announce an observation by the camera on the hand."""
-        self._robot.expect_near()
+        self._robot.expect_near(camera)
 
     def stop_observing(self) -> None:
         """An observation ends by itself."""

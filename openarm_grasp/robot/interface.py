@@ -135,7 +135,7 @@ class RobotInterface(Protocol):
     def warn(self, text: str) -> None:
         """Report something that does not stop the work."""
 
-    def expect_near(self) -> None:
+    def expect_near(self, camera: str) -> None:
         """Announce an observation by the camera on the hand, which may need a moment to wake."""
 
     def stop_observing(self) -> None:
@@ -149,8 +149,8 @@ class RobotInterface(Protocol):
     async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
         """Carry out several coroutines at once; all end before this does, then the first error is raised."""
 
-    async def observe(self, count: int, *, near: bool = False) -> Frames:
-        """Frames of detections that are taken from now on, by the camera over the table or the one on the hand."""
+    async def observe(self, count: int, *, near: str = "") -> Frames:
+        """Frames of detections that are taken from now on, by the camera over the table, or by one on a hand."""
         ...
 
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:

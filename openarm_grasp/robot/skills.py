@@ -8,6 +8,7 @@ does not succeed.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -82,14 +83,14 @@ class Skills:
         await robot.until(lambda: robot.now_ns >= end_ns, limit, f"waiting {duration:g} s of robot time")
 
     # --- observing
-    async def observe(self, count: int, *, near: bool = False) -> Frames:
-        """Frames of detections that are taken from now on, by the camera over the table or the one on the hand."""
+    async def observe(self, count: int, *, near: str = "") -> Frames:
+        """Frames of detections that are taken from now on, by the camera over the table, or by one on a hand."""
         self.robot.check()
         return await self.robot.observe(count, near=near)
 
-    def expect_near(self) -> None:
+    def expect_near(self, camera: str) -> None:
         """Announce an observation by the camera on the hand."""
-        self.robot.expect_near()
+        self.robot.expect_near(camera)
 
     def stop_observing(self) -> None:
         """Let the detector rest."""
@@ -213,9 +214,10 @@ class Skills:
         guard = still_held if carrying else None if line is None else on_line
         await self.robot.follow(arm, trajectory, f"{arm} arm: {what}", guard)
 
-    async def follow_and_grip(self, arm: str, trajectory: Trajectory, what: str, *, position: float, how: str) -> None:
-        """Follow a trajectory and move the fingers at the same time; arguments as of `follow` and `grip`."""
-        await self.robot.together([lambda: self.grip(arm, position, how), lambda: self.follow(arm, trajectory, what)])
+    async def follow_and_grip(self, arm: str, trajectory: Trajectory, what: str, how: Literal["open", "close"]) -> None:
+        """Follow a trajectory and move the fingers at the same time; arguments and errors as of `follow`, `open`."""
+        grip = self.open if how == "open" else self.close
+        await self.robot.together([lambda: grip(arm, how), lambda: self.follow(arm, trajectory, what)])
 
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Move the TCP to a pose on a straight line."""
@@ -274,31 +276,46 @@ class Skills:
         """What the planner carries in a hand, TCP frame; None when it knows of nothing there."""
         return self.robot.held_box(arm)
 
-    async def grip(self, arm: str, position: float, what: str, effort: float = 0.0) -> None:
-        """Move the fingers until they are there or push against something.
+    def is_open(self, arm: str) -> bool:
+        """Whether a hand is as wide open as for a grasp; raises as `aperture`."""
+        reader = self._hands[arm]
+        return reader.finger() >= reader.hand.parts.opening - self._config.hand.open_tolerance
+
+    async def open(self, arm: str, what: str) -> None:
+        """Open the hand.
 
         Args:
             arm: Whose hand.
-            position: Of each finger, m; 0 closes.
-            what: For errors, for example "close".
-            effort: Largest force, N; 0: the driver's limit.
+            what: For errors, for example "release".
 
         Raises:
-            OpenArmError: EXECUTION_FAILED, when an opening hand does not open, or a closing one neither closes nor
-                meets anything.
+            OpenArmError: EXECUTION_FAILED, when it does not open.
         """
         self.robot.check()
-        hand, robot, what = self._hands[arm], self.robot, f"{arm} hand: {what}"
-        ended_well = await robot.grip(arm, hand.joint, position, what, effort)
-        if position > 0.0:
-            # The result may be here before the joint state that shows it.
-            least, end_ns = position - self._config.hand.open_tolerance, robot.now_ns + SPEED_WINDOW_NS
-            limit = self._config.limits.answer_timeout
-            await robot.until(lambda: hand.finger() >= least or robot.now_ns > end_ns, limit, what)
-            if hand.finger() < least:
-                reached = f"{hand.finger() * 1e3:.1f} mm of {position * 1e3:.0f} mm"
-                raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers stopped at {reached}")
-        elif not ended_well:
+        reader, robot, what = self._hands[arm], self.robot, f"{arm} hand: {what}"
+        await robot.grip(arm, reader.joint, reader.hand.opened, what, 0.0)
+        # The result may be here before the joint state that shows it.
+        end_ns, limit = robot.now_ns + SPEED_WINDOW_NS, self._config.limits.answer_timeout
+        await robot.until(lambda: self.is_open(arm) or robot.now_ns > end_ns, limit, what)
+        if not self.is_open(arm):
+            reached = f"{reader.finger() * 1e3:.1f} mm of {reader.hand.parts.opening * 1e3:.0f} mm"
+            raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers stopped at {reached}")
+
+    async def close(self, arm: str, what: str, force: float = 0.0) -> None:
+        """Close the hand until it presses on something.
+
+        Args:
+            arm: Whose hand.
+            what: For errors, for example "close".
+            force: Largest, N; 0: the driver's limit.
+
+        Raises:
+            OpenArmError: EXECUTION_FAILED, when it neither closes nor meets anything.
+        """
+        self.robot.check()
+        reader, what = self._hands[arm], f"{arm} hand: {what}"
+        hand = reader.hand
+        if not await self.robot.grip(arm, reader.joint, hand.closed, what, force * abs(hand.lever)):
             raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers neither arrived nor met anything")
 
     async def measure(

@@ -188,18 +188,18 @@ class GraphRobot:
         if faults:  # an emergency stop ends all, and only an arm's controller can say that it was one
             raise next((f for f in faults if isinstance(f, OpenArmError) and f.code is Code.STOPPED), faults[0])
 
-    async def observe(self, count: int, *, near: bool = False) -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> Frames:
         """Frames of detections that are taken from now on."""
         if not near:
             return await self._nodes.observe(count, DETECTIONS, self._config.detect.frame_timeout)
-        config = self._config.near
-        if not self._nodes.sees(config.topic):
-            raise OpenArmError(Code.NOT_READY, f"no node publishes {config.topic}")
-        return await self._nodes.observe(count, config.topic, config.timeout)
+        topic = self._config.near.topic.format(camera=near)
+        if not self._nodes.sees(topic):
+            raise OpenArmError(Code.NOT_READY, f"no node publishes {topic}")
+        return await self._nodes.observe(count, topic, self._config.near.timeout)
 
-    def expect_near(self) -> None:
+    def expect_near(self, camera: str) -> None:
         """Wake the detector of the camera on the hand."""
-        self._nodes.listen(self._config.near.topic)
+        self._nodes.listen(self._config.near.topic.format(camera=camera))
 
     def stop_observing(self) -> None:
         """Leave all detections."""

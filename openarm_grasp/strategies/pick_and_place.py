@@ -145,14 +145,14 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
     arm, config, robot = grasp.arm, run.config, run.robot
     run.tried += 1
     run.enter(State.MOVE_TO_PREGRASP, why)
-    what, opening = "move to the pre-grasp", config.hand.opening
-    second = arm == run.context.looks
-    if second:
-        robot.expect_near()
-    await robot.follow_and_grip(arm, plan.transfer, what, position=opening, how="open")
+    what = "move to the pre-grasp"
+    camera = run.context.looks.get(arm, "")
+    if camera:
+        robot.expect_near(camera)
+    await robot.follow_and_grip(arm, plan.transfer, what, "open")
     why = "the open hand is before the object"
-    if second:
-        grasp, plan, why = await _correct(run, grasp, plan)
+    if camera:
+        grasp, plan, why = await _correct(run, grasp, plan, camera)
     run.enter(State.MOVE_TO_GRASP, why)
     target = grasp.sighting.target
     still, why = verdicts.judge_still(target, (await robot.observe(1)).frames, config.held)
@@ -174,14 +174,15 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
     return grasp, plan, f"the hand is at the grasp, off by {error * 1e3:.1f} mm"
 
 
-async def _correct(run: Run, grasp: Grasp, plan: Planned) -> tuple[Grasp, Planned, str]:
+async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[Grasp, Planned, str]:
     """Observe with the camera on the hand, and go where the object is seen from there.
 
     Whatever keeps the second observation from helping, the grasp goes on with what is known.
     """
-    config, near, robot = run.config, run.config.near, run.robot
-    run.enter(State.MOVE_TO_PREGRASP, f"the open hand is before the object; observing with the {near.camera} camera")
-    corrected, why = await second_look(run, grasp, config.confirm.correction if run.request.confirm else near.least)
+    config, robot = run.config, run.robot
+    run.enter(State.MOVE_TO_PREGRASP, f"the open hand is before the object; observing with the {camera} camera")
+    least = config.confirm.correction if run.request.confirm else config.near.least
+    corrected, why = await second_look(run, grasp, camera, least)
     if corrected is None:
         return grasp, plan, why
     run.findings.sighting, run.offered = corrected.sighting, (corrected.candidate,)
@@ -216,7 +217,7 @@ async def close(run: Run, grasp: Grasp, why: str) -> str:
     run.hand = Hand.HOLDING
     try:
         await robot.wait(timing.pause_at_grasp)
-        await robot.grip(arm, 0.0, "close", run.config.hand.close_effort)
+        await robot.close(arm, "close", run.config.hand.close_effort)
         await robot.wait(timing.after_close)
         evidence = await robot.measure(arm, c.width, c.T_base_tcp, settle=timing.settle_limit)
         gripper = verdicts.judge_grip(evidence, run.config.held)
@@ -309,7 +310,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
             raise OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}")
         run.enter(State.PLACE, gripper.reason)
         await robot.follow(arm, plan.approach, "put down", carrying=True)
-        await robot.grip(arm, config.hand.opening, "release")
+        await robot.open(arm, "release")
     except OpenArmError as error:
         if error.code is Code.GRASP_LOST:
             run.hand = Hand.FREE

@@ -20,11 +20,12 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.candidates import UP, GraspCandidate
+from openarm_grasp.planning.candidates import UP, GraspCandidate, tips_height
 from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.confirm import PUSH, agree
@@ -132,7 +133,7 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
     """The other arm is asked first: it comes from the other side."""
     config, robot, faults = task.context.config, task.robot, list[str]()
     for arm in sorted(robot.description.arm_names, key=lambda arm: arm == taker):
-        ways = push_ways(found.target, end, config, closed_hand(robot.description, arm))
+        ways = push_ways(found.target, end, config, closed_hand(robot.description, arm), task.context.hand)
         if not ways:
             faults.append(f"{arm} hand: {found.target.label!r} would tip over")
             continue
@@ -198,7 +199,7 @@ async def _go_behind(task: Task, planned: Push) -> None:
     """Close the hand and bring it behind the object."""
     arm, robot, T_base_tcp = planned.arm, task.robot, planned.way.T_base_tcp
     what = "move behind the object"
-    await robot.follow_and_grip(arm, planned.plan.transfer, what, position=0.0, how="close")
+    await robot.follow_and_grip(arm, planned.plan.transfer, what, "close")
     await robot.follow(arm, planned.plan.approach, "move down behind the object")
     error = (await robot.measure(arm, 0.0, T_base_tcp)).tcp_error
     if error > task.context.config.held.max_tcp_error:
@@ -237,7 +238,9 @@ def destinations(target: Detection, others: Sequence[Detection], context: GraspC
     return tuple(np.array([x, y]) for _, _, x, y in sorted(found))
 
 
-def push_ways(target: Detection, end: Array, config: GraspConfig, hand: Array) -> tuple[GraspCandidate, ...]:
+def push_ways(
+    target: Detection, end: Array, config: GraspConfig, hand: Array, measures: HandParts
+) -> tuple[GraspCandidate, ...]:
     """How a closed hand may stand behind the object, the most upright first.
 
     One of its four faces points ahead, so that a flat side of the object is met flat; it leans sideways, or with its
@@ -249,6 +252,7 @@ def push_ways(target: Detection, end: Array, config: GraspConfig, hand: Array) -
         end: (2,) where it should be pushed.
         config: Parameters.
         hand: Points (n, 3) of the closed hand, TCP frame.
+        measures: Of the hand.
     """
     way = np.array([*(end - target.p_base[:2]), 0.0])
     ahead = _direction(way)
@@ -265,7 +269,7 @@ def push_ways(target: Detection, end: Array, config: GraspConfig, hand: Array) -
             continue
         tilt = radians(tilt_deg)
         R = se3.rotation_from_z_y(sin(tilt) * heading - cos(tilt) * UP, y_tool)
-        height = config.hand.tip_clearance + config.hand.tip_clearance_tilted * sin(tilt)
+        height = tips_height(tilt, measures)
         front, low = _front(hand @ R.T, ahead, half_width, (-height, tall - height))
         if low + height > 0.5 * tall:
             continue

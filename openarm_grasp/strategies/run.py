@@ -119,8 +119,10 @@ class Run:
 
     def ways(self, arm: str, sighting: Sighting) -> retries.Ways:
         """Grasps for an arm; those that have failed apart from the others."""
-        shoulder = self.context.shoulders.get(arm, (0.0, 0.0))
-        return retries.ways(sighting.target, self.config, self.failed, shoulder_xy=shoulder, others=sighting.others)
+        shoulder, hand = self.context.shoulders.get(arm, (0.0, 0.0)), self.context.hand
+        return retries.ways(
+            sighting.target, self.config, hand, self.failed, shoulder_xy=shoulder, others=sighting.others
+        )
 
     def start_again(self, grasp: Grasp, placed: Placed | None) -> str:
         """Begin the next attempt at the same object, the failed grasp remembered; returns why.

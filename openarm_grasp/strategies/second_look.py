@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     from openarm_grasp.strategies.run import Run
 
 
-async def second_look(run: Run, grasp: Grasp, least: float) -> tuple[Grasp | None, str]:
+async def second_look(run: Run, grasp: Grasp, camera: str, least: float) -> tuple[Grasp | None, str]:
     """Observe from the pre-grasp.
 
     Args:
         run: The request.
         grasp: That is planned.
+        camera: On the hand.
         least: Smaller corrections are not made, m.
 
     Returns:
         The grasp where the object is seen from there, None when the one that is planned stays; and why.
     """
-    near = run.config.near
     try:
-        seen = await run.robot.observe(near.frames, near=True)
+        seen = await run.robot.observe(run.config.near.frames, near=camera)
     except OpenArmError as error:
         reraise_stop(error)
         return None, f"no second observation: {error.message}"
@@ -44,7 +44,7 @@ async def second_look(run: Run, grasp: Grasp, least: float) -> tuple[Grasp | Non
         return None, f"the second observation does not help: {error.message}"
     dx, dy, _ = target.p_base - grasp.sighting.target.p_base
     size = float(np.hypot(dx, dy))
-    text = f"the {near.camera} camera sees it {size * 1e3:.1f} mm off ({dx * 1e3:+.1f}, {dy * 1e3:+.1f})"
+    text = f"the {camera} camera sees it {size * 1e3:.1f} mm off ({dx * 1e3:+.1f}, {dy * 1e3:+.1f})"
     if size < least:
         return None, text
     return replace(grasp, sighting=replace(grasp.sighting, target=target), candidate=candidate), text

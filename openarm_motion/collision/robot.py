@@ -124,11 +124,11 @@ class CollisionRobot:
         links: list[str] = []
         solids: list[Solid] = []
         for link in description.links.values():
-            if link.meshes and link.name in self.arm.moving:
+            if link.unread and link.name in self.arm.moving:
                 raise OpenArmError(
                     Code.INVALID_ARGUMENT,
-                    f"link {link.name!r} has meshes ({', '.join(link.meshes)}); read the robot with `load_robot`, or"
-                    " give it boxes, cylinders or spheres",
+                    f"link {link.name!r} has meshes ({', '.join(link.unread)}); read it with"
+                    " `RobotDescription.from_files`, or give it boxes, cylinders or spheres",
                 )
             frame = self.model.frames[self.model.getFrameId(link.name, pin.FrameType.BODY)]
             for shape in link.collision:

@@ -215,7 +215,6 @@ class ArmLinks:
         gripper: Links that further joints beyond the arm move: the fingers and what is fixed to them.
         hand: The gripper, what carries it, and the tool link: what a held object may touch.
         fixed: Links of the robot that no joint moves.
-        gripper_joints: The joints that move the gripper's links, followers left out.
         body: Link -> name of the first link of the rigid body that it belongs to.
         neighbours: Pairs of rigid bodies that one joint connects.
     """
@@ -224,7 +223,6 @@ class ArmLinks:
     gripper: frozenset[str]
     hand: frozenset[str]
     fixed: frozenset[str]
-    gripper_joints: tuple[str, ...]
     body: Mapping[str, str]
     neighbours: frozenset[frozenset[str]]
 
@@ -237,7 +235,6 @@ class ArmLinks:
         after = {link: _after(joints, kinematics.names[-1]) for link, joints in chains.items()}
         gripper = {link for link, joints in after.items() if joints}
         carriers = {joints[0].parent for joints in after.values() if joints}
-        gripper_joints = [j.name for joints in after.values() for j in joints if j.mimic is None]
         neighbours = frozenset(
             frozenset((body[joint.parent], body[joint.child]))
             for joint in description.joints.values()
@@ -250,7 +247,6 @@ class ArmLinks:
             gripper=frozenset(gripper),
             hand=frozenset(hand | {kinematics.tool_link}),
             fixed=frozenset(link for link, joints in chains.items() if not joints),
-            gripper_joints=tuple(dict.fromkeys(gripper_joints)),
             body=body,
             neighbours=neighbours,
         )

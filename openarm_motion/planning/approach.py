@@ -232,7 +232,7 @@ class _Checks:
     def __init__(self, arm: Arm, now: StartState, request: ApproachRequest) -> None:
         self._arm, self._now, self._request = arm, now, request
         # hands grasp open; a hand that holds something keeps its opening until it lets go
-        opened = arm.config.planning.gripper_open
+        opened = arm.opened
         before = None if request.attached else opened
         scene = partial(arm.scene, now.state, environment=now.environment)
         self.free = scene(request.obstacles, request.attached, gripper=before)
@@ -369,10 +369,11 @@ class _Checks:
         """Seconds of travel, and up to one more for a configuration near to a joint limit."""
         return travel + 1.0 - min(self._arm.kinematics.margin(solution.q), _COMFORT) / _COMFORT
 
-    def _opening(self, pose: Array) -> float:
-        """Finger position around what is carried: half its extent along the opening axis, the tool's y."""
+    def _opening(self, pose: Array) -> float | None:
+        """Finger around what is carried, m: half its extent along the opening axis, the tool's y."""
         extents = [float(np.abs(box.T[:3, :3].T @ pose[:3, 1]) @ box.size) for box in self._carried]
-        return min(self._arm.config.planning.gripper_open, 0.5 * max(extents, default=0.0))
+        opened = self._arm.opened
+        return None if opened is None else min(opened, 0.5 * max(extents, default=0.0))
 
 
 def _require(scene: CollisionScene, q: Array, where: str) -> None:

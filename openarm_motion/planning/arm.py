@@ -214,6 +214,9 @@ class Arm(PlanningGroup):
         self.name, self.title = name, f"the {name} arm"
         self.config = config
         self.description = description
+        self._hand = description.hands.get(name)
+        #: Distance of the pads of an open hand from its middle, m; None without a hand.
+        self.opened = self._hand.parts.opening if self._hand else None
         self.kinematics = ArmKinematics(description, config.tool_link.format(arm=name) or description.tcp_link(name))
         self.names, self.lower, self.upper = self.kinematics.names, self.kinematics.lower, self.kinematics.upper
         self.inverse = InverseKinematics(self.kinematics, config.planning.swivels)
@@ -311,7 +314,7 @@ class Arm(PlanningGroup):
             held: Boxes held by this arm, tool frame.
             touchable: Ids of boxes that the fingers may touch.
             straight: Clearance of straight parts instead of free paths.
-            gripper: Position of the finger joints instead of the present one, m.
+            gripper: Distance of the finger pads from the middle instead of the present one, m.
             environment: Bodies of the planning scene, as certain as the table, the map, and the distance of the arms.
             carried: What goes with the other arm, see `CollisionContext`.
             arms: Distance that the arms keep from each other instead of that of clearance and environment, m.
@@ -323,7 +326,7 @@ class Arm(PlanningGroup):
         return CollisionScene(
             self.robot,
             CollisionContext(
-                state=state if gripper is None else self.with_gripper(state, gripper),
+                state=self.with_gripper(state, gripper),
                 boxes=[*certain, *boxes],
                 held=held,
                 carried=carried,
@@ -335,9 +338,11 @@ class Arm(PlanningGroup):
             ),
         )
 
-    def with_gripper(self, state: Mapping[str, float], position: float) -> dict[str, float]:
-        """The state with the arm's finger joints at another position, m."""
-        return {**state, **dict.fromkeys(self.robot.arm.gripper_joints, position)}
+    def with_gripper(self, state: Mapping[str, float], finger: float | None) -> Mapping[str, float]:
+        """The state with the finger pads at another distance from the middle of the hand, m; None: where they are."""
+        if self._hand is None or finger is None:
+            return state
+        return {**state, self._hand.joint: self._hand.position(finger)}
 
     def relax(self, scene: CollisionScene, start: Array) -> None:
         """Let the arm leave its start: where it overlaps an estimated box, the box is wrong, not the arm.

@@ -208,7 +208,7 @@ class ArmCoordination:
     def _hands_open(self, state: Mapping[str, float]) -> Mapping[str, float]:
         """The joints with all hands open: they may open on the way."""
         for arm in self._arms.values():
-            state = arm.with_gripper(state, arm.config.planning.gripper_open)
+            state = arm.with_gripper(state, arm.opened)
         return state
 
     def _others(self, arm: Arm, now_ns: int, state: Mapping[str, float]) -> list[ActiveMotion]:

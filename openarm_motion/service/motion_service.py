@@ -17,7 +17,7 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.scene import Table
+from openarm_common.robot.work import Table
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid, box_from
 from openarm_motion.config import MotionConfig

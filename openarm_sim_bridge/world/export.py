@@ -66,18 +66,18 @@ def render(
     *,
     view: str = "three_quarter",
     seed: int = 0,
-    opening: float = 0.03,
+    finger: float = 0.03,
 ) -> Bytes:
     """Draw robot and scene.
 
     Args:
         scene: Name or path of a scene, or "random".
-        posture: State of the SRDF group "both_arms".
+        posture: State of the arms in the SRDF.
         width: Pixels.
         height: Pixels.
         view: One of `VIEWS`, or the name of a camera.
         seed: Of the scene "random".
-        opening: Position of the finger joints, m.
+        finger: Distance of the pads from the middle of the hands, m.
 
     Returns:
         (height, width, 3) RGB.
@@ -90,9 +90,9 @@ def render(
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"unknown view {view!r}; views: {', '.join(VIEWS)}; cameras: {', '.join(cameras)}"
         )
-    q = description.group_state("both_arms", posture) | {
-        description.finger_joint(side): opening for side in description.arm_names
-    }
+    q = {hand.joint: hand.position(finger) for hand in description.hands.values()}
+    for arm in description.arm_names:
+        q |= description.group_state(f"{arm}_arm", posture)
     spec = build_spec(description, load_scene(scene, seed), cameras)
     _light_for_people(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = max(width, 640), max(height, 480)

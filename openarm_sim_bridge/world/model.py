@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import mujoco
@@ -20,8 +21,9 @@ from pydantic import Field
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.config import Config
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.xml_text import floats
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
 from openarm_sim_bridge.world.hardware import IDEAL, MOTOR_RANGE, Hardware, drawn
@@ -41,7 +43,8 @@ class PhysicsConfig(Config):
     """Solver, contact and finger settings with which grasps hold by friction alone.
 
     `impratio` and a few no-slip iterations keep a held object from creeping. The finger force is `finger_kp` times the
-    remaining travel, up to `finger_force`. The motors of the arms are `HardwareConfig`.
+    remaining travel of a finger, up to `finger_force`, also where a hinge drives it. The motors of the arms are
+    `HardwareConfig`.
     """
 
     timestep: float = Field(
@@ -71,7 +74,6 @@ class PhysicsConfig(Config):
     finger_kp: float = Field(default=2000.0, gt=0.0, description="N/m")
     finger_kv: float = Field(default=40.0, ge=0.0, description="N s/m")
     finger_force: float = Field(default=30.0, gt=0.0, description="N; each pad presses with half of it")
-    finger_armature: float = Field(default=0.05, ge=0.0, description="kg")
 
 
 def build_spec(
@@ -146,7 +148,6 @@ def robot_spec(
     hardware = hardware or drawn(IDEAL, description)
     spec = _import_urdf(description)
     _set_options(spec, physics)
-    _sort_geoms(spec, description)
     for side in description.arm_names:
         _actuate_arm(spec, description, side, hardware)
         _actuate_gripper(spec, description, side, physics)
@@ -164,17 +165,37 @@ def robot_spec(
 
 def _import_urdf(description: RobotDescription) -> mujoco.MjSpec:
     root = ET.fromstring(description.urdf)
+    assets = _take_files(root)
     # By default the importer merges links that are fixed to each other, with their names, and drops visual geometry.
     extension = ET.SubElement(root, "mujoco")
     ET.SubElement(extension, "compiler", fusestatic="false", discardvisual="false")
     try:
-        spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+        spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"), assets=assets)
     except ValueError as error:
         raise OpenArmError(
             Code.CONFIG_INVALID, f"MuJoCo does not read the URDF of {description.name!r}: {error}"
         ) from error
     spec.compiler.autolimits = True
+    for mesh in spec.meshes:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX  # masses are the description's: any will do
+    _sort_geoms(spec, root)
     return spec
+
+
+def _take_files(root: ET.Element) -> dict[str, bytes]:
+    """Read the mesh files of a URDF, and name each in it as the importer asks for it: one name a file and scale."""
+    assets, names = dict[str, bytes](), dict[tuple[str, str], str]()
+    for mesh in root.iter("mesh"):
+        file, scale = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
+        if (file, scale) not in names:
+            path = Path(file.removeprefix("file://"))
+            names[file, scale] = f"{len(names)}_{path.name}"
+            try:
+                assets[names[file, scale]] = path.read_bytes()
+            except OSError as error:
+                raise OpenArmError(Code.CONFIG_INVALID, f"can't read mesh {path}: {said(error)}") from error
+        mesh.set("filename", names[file, scale])
+    return assets
 
 
 def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
@@ -186,25 +207,26 @@ def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     option.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{physics.jacobian.upper()}")
 
 
-def _sort_geoms(spec: mujoco.MjSpec, description: RobotDescription) -> None:
+def _sort_geoms(spec: mujoco.MjSpec, root: ET.Element) -> None:
     """Sort the geoms into visual and collision geometry, and give materials to the former (URDF has colours only)."""
-    for link in description.links.values():
-        for primitive in link.visual:
-            geom = spec.geom(primitive.name)
-            geom.group = _VISUAL_GROUP
-            geom.mass = 0.0
-            if primitive.material and primitive.rgba is not None:
-                if spec.material(primitive.material) is None:
-                    specular, shininess = _GLOSS.get(primitive.material, _MATT)
-                    spec.add_material(
-                        name=primitive.material, rgba=primitive.rgba, specular=specular, shininess=shininess
-                    )
-                geom.material = primitive.material
-                geom.rgba = (0.5, 0.5, 0.5, 1.0)  # the default: anything else would override the material
-        for primitive in link.collision:
-            geom = spec.geom(primitive.name)
-            geom.group = _COLLISION_GROUP
-            geom.mass = 0.0  # masses are those of the URDF
+    colours = {material.get("name", ""): material.find("color") for material in root.findall("material")}
+    for shape in root.findall("link/visual"):
+        geom = spec.geom(shape.get("name"))
+        geom.group, geom.mass = _VISUAL_GROUP, 0.0
+        material = shape.find("material")
+        name = "" if material is None else material.get("name", "")
+        colour = colours.get(name) if material is None or material.find("color") is None else material.find("color")
+        if not name or colour is None:
+            continue
+        if spec.material(name) is None:
+            specular, shininess = _GLOSS.get(name, _MATT)
+            rgba = floats(colour.get("rgba", ""), 4, colour)
+            spec.add_material(name=name, rgba=rgba, specular=specular, shininess=shininess)
+        geom.material = name
+        geom.rgba = (0.5, 0.5, 0.5, 1.0)  # the default: anything else would override the material
+    for shape in root.findall("link/collision"):
+        geom = spec.geom(shape.get("name"))
+        geom.group, geom.mass = _COLLISION_GROUP, 0.0  # masses are those of the URDF
 
 
 def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: str, hardware: Hardware) -> None:
@@ -240,11 +262,12 @@ def _mount_softly(hand: mujoco.MjsBody, stiffness: float) -> None:
 
 
 def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: str, physics: PhysicsConfig) -> None:
-    leader = description.finger_joint(side)
+    hand = description.hand(side)
+    leader, lever = hand.joint, abs(hand.lever)
     follower = next(joint.name for joint in description.joints.values() if joint.mimic == leader)
     for name in (leader, follower):
         joint = spec.joint(name)
-        joint.armature = physics.finger_armature
+        joint.armature = hand.parts.armature
         joint.actfrclimited = False
         pad = spec.geom(f"{description.joints[name].child}_pad_collision")
         # Priority: the pad's values decide over those of what it touches.
@@ -253,7 +276,8 @@ def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: s
         pad.condim = physics.pad_condim
         pad.solref = physics.contact_solref
         pad.solimp = physics.contact_solimp
-    servo = _add_servo(spec, leader, physics.finger_kp, physics.finger_kv, physics.finger_force)
+    kp, kv = physics.finger_kp * lever**2, physics.finger_kv * lever**2
+    servo = _add_servo(spec, leader, kp, kv, physics.finger_force * lever)
     servo.ctrlrange = (description.joints[leader].lower, description.joints[leader].upper)
     # The importer couples mimic joints too, but softly: the fingers would drift apart under load.
     for equality in list(spec.equalities):

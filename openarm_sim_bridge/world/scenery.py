@@ -19,7 +19,8 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, CameraConfig, true_mount
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
-from openarm_common.scene.scene import Fixture, SceneObject, Table
+from openarm_common.robot.work import Table
+from openarm_common.scene.scene import Fixture, SceneObject
 
 _TABLE_RGBA = (0.80, 0.785, 0.76, 1.0)
 _FLOOR_RGBA = (0.48, 0.48, 0.49, 1.0)  # plain: a texture that fills half of an image doubles the cost of drawing it

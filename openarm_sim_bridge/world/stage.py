@@ -50,7 +50,9 @@ class Stage:
         self.encoders = made.encoders(description, self.joint_names)
         self.home: dict[str, float] = {}
         for side in description.arm_names:
-            self.home |= description.group_state(f"{side}_arm", "home") | {description.finger_joint(side): 0.0}
+            self.home |= description.group_state(f"{side}_arm", "home") | {
+                description.finger_joint(side): description.hand(side).closed
+            }
 
     @cached_property
     def servos(self) -> dict[str, ServoModel]:

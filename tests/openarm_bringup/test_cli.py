@@ -182,7 +182,7 @@ def test_ps_and_logs_find_a_running_graph(capsys: pytest.CaptureFixture[str]) ->
     runs.write_record(record)
     assert cli.run(["ps", "--seconds", "0.05"]) == 0
     text = capsys.readouterr().out
-    assert "toy: ready, domain 5" in text
+    assert "toy: ready, robot openarm_v1, domain 5" in text
     assert str(me.pid) in text
     assert cli.run(["logs", "arm", "-n", "2"]) == 0
     assert capsys.readouterr().out == "two\nthree\n"
@@ -217,8 +217,8 @@ def test_several_graphs_are_distinguished_by_domain_and_one_that_lost_a_node_is_
             (tmp_path / str(domain) / "logs" / f"eye_{domain}.log").write_text(f"I am eye {domain}\n")
         assert cli.run(["ps", "--seconds", "0.05"]) == 0
         text = capsys.readouterr().out
-        assert "part_5: degraded, without eye_5, domain 5" in text
-        assert "part_7: ready, domain 7" in text
+        assert "part_5: degraded, without eye_5, robot openarm_v1, domain 5" in text
+        assert "part_7: ready, robot openarm_v1, domain 7" in text
         with pytest.raises(OpenArmError, match=r"several graphs are running: part_5 in domain 5 .* choose one"):
             runs.the_running()
         assert runs.the_running(5).graph == "part_5"

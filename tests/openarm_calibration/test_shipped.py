@@ -15,10 +15,10 @@ from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore, StoredCalibration, of_these_mounts, places
 from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras, true_mount
-from openarm_common.resources import config_dir
+from openarm_common.resources import models_dir
 from openarm_common.robot.description import RobotDescription
 
-SHIPPED = config_dir() / "calibration" / "mount_seed_1"
+SHIPPED = models_dir() / "robots" / "openarm_v1" / "calibration" / "mount_seed_1"
 SESSIONS = Path(__file__).parent / "data"
 
 

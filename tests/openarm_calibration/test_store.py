@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 from openarm_calibration.store.store import CalibrationStore, StoredCalibration, of_these_mounts
+from openarm_calibration.store.table import StoredTable, TableStore
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.records import OfAnotherRobot
+from openarm_common.robot.folder import ROBOT
+from openarm_common.robot.servo_store import ServoStore, StoredServos
 
 
 def calibration(x: float = 0.1, **more) -> StoredCalibration:
@@ -41,7 +45,7 @@ def test_intrinsics_are_kept_and_hashed_and_a_file_of_old_without_them_is_good(t
     path.write_text(path.read_text().replace("fx: 415.7", "fx: 425.7"))
     with pytest.raises(OpenArmError, match="was edited"):
         store.load("wrist")
-    of_old = calibration()
+    of_old = calibration(robot="")
     assert "intrinsics" not in store.save(of_old).read_text()
     assert of_old.digest() == "3cc517fe953ead421cfa9c408191ac2e654289da5f452c8b3301a03cbff3907e"
     with pytest.raises(OpenArmError, match=r"fx=0, fy=415\.7, expected 1"):
@@ -120,3 +124,59 @@ def test_a_folder_that_cant_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(OpenArmError, match="can't write") as caught:
         CalibrationStore(tmp_path / "file").save(calibration())
     assert caught.value.code == Code.ENVIRONMENT
+
+
+def test_a_mount_of_another_robot_is_refused_and_that_of_this_one_in_the_history_is_used(
+    tmp_path: Path, nearer, monkeypatch
+) -> None:
+    store = CalibrationStore(tmp_path / "store")
+    monkeypatch.setenv(ROBOT, "openarm_v1")
+    of_old = store.save(calibration(0.1, robot=""))  # files of old are of openarm_v1
+    assert store.load("wrist").robot == ""
+    monkeypatch.setenv(ROBOT, nearer)
+    with pytest.raises(OfAnotherRobot, match=r"wrist\.yaml is of robot 'openarm_v1', expected 'nearer'") as caught:
+        store.load("wrist")
+    assert caught.value.code == Code.CONFIG_INVALID
+    assert store.in_use("wrist", None) is None
+    found, reasons = of_these_mounts([store], "wrist", "openarm_right_link7", None)
+    assert found is None
+    assert "is of robot 'openarm_v1'" in reasons[0]
+    mine = calibration(0.2)
+    assert "robot: nearer" in store.save(mine).read_text()
+    assert store.load("wrist") == mine
+    monkeypatch.setenv(ROBOT, "openarm_v1")
+    found = store.find("wrist")
+    assert found is not None
+    assert found.record.position[0] == 0.1
+    assert found.warning == ""  # robots that store in turn are no fault
+    assert of_old.is_file()
+
+
+def test_going_back_leaves_the_history_of_another_robot(tmp_path: Path, nearer, monkeypatch) -> None:
+    store = CalibrationStore(tmp_path / "store")
+    store.save(calibration(0.1))
+    store.save(calibration(0.2))
+    monkeypatch.setenv(ROBOT, "openarm_v1")
+    store.save(calibration(0.3))
+    monkeypatch.setenv(ROBOT, nearer)
+    assert store.rollback("wrist").position[0] == 0.1
+    assert store.load("wrist").position[0] == 0.1
+    monkeypatch.setenv(ROBOT, "openarm_v1")
+    assert [record.position[0] for record in store.history("wrist")] == [0.3]
+
+
+def test_the_table_and_the_servos_of_another_robot_are_not_those_of_this_one(
+    tmp_path: Path, nearer, monkeypatch
+) -> None:
+    tables, servos = TableStore(tmp_path), ServoStore(tmp_path)
+    tables.save(StoredTable(height=0.46, configured=0.45))
+    values = dict.fromkeys(("stiffness", "damping", "friction", "armature", "latency"), (1.0,) * 7)
+    servos.save(StoredServos(arm="left", **values))
+    assert tables.in_use(0.45, None)[0] == 0.46
+    assert servos.load("left").robot == nearer
+    monkeypatch.setenv(ROBOT, "openarm_v1")
+    height, source, fault = tables.in_use(0.45, None)
+    assert (height, fault) == (0.45, "")
+    assert "is of robot 'nearer', expected 'openarm_v1'" in source
+    with pytest.raises(OfAnotherRobot, match=r"left\.yaml is of robot 'nearer'"):
+        servos.find("left")

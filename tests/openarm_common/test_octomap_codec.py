@@ -171,3 +171,16 @@ def test_a_box_of_blocks_begins_and_ends_between_blocks() -> None:
     for key, n in ((4, 8), (8, 12)):
         with pytest.raises(OpenArmError, match="multiples of 8"):
             VoxelBlocks(Lattice(0.02, (key, 0, 0), (n, 8, 8)))
+
+
+@pytest.mark.parametrize("robot", ["openarm_v1", "Röbel 2"])
+def test_a_file_says_in_a_comment_of_which_robot_it_is(tmp_path: Path, robot: str) -> None:
+    payload = encode_states(LATTICE, states_of(1))
+    write_file(tmp_path / "with.bt", payload, 0.02, robot)
+    write_file(tmp_path / "without.bt", payload, 0.02)
+    said, silent = (read_file(tmp_path / f"{name}.bt") for name in ("with", "without"))
+    assert (said.robot, silent.robot) == (robot, "")
+    assert said.raw.tobytes() == silent.raw.tobytes()
+    lines = (tmp_path / "with.bt").read_bytes().partition(b"data\n")[0].decode().splitlines()
+    assert lines[0] == "# Octomap OcTree binary file"  # all that readers require of comments
+    assert [line for line in lines if not line.startswith("#")] == ["id OcTree", f"size {payload.nodes}", "res 0.02"]

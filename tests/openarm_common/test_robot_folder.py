@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 import yaml
 
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_common.robot import folder
 from openarm_common.robot.description import RobotDescription
+from openarm_common.scene import scene
+from openarm_common.scene.scene import Scene, load_scene, parse_scene
 
 
 @pytest.fixture
@@ -58,6 +61,17 @@ def test_signs_of_the_mirror_are_as_many_as_joints(robots):
         RobotDescription.from_folder("mine")
 
 
+def test_cameras_are_those_of_the_robot_of_the_process(robots, monkeypatch):
+    monkeypatch.setenv(folder.ROBOT, "mine")
+    assert list(load_cameras()) == ["overhead", "wrist", "spectator"]
+    text = (robots / "cameras.yaml").read_text().replace("name: overhead", "name: above")
+    (robots / "mine.yaml").write_text(text)
+    altered(robots, cameras="mine.yaml")
+    assert list(load_cameras()) == ["above", "wrist", "spectator"]
+    altered(robots, cameras="")
+    assert load_cameras() == {}
+
+
 def test_an_arm_that_the_robot_lacks_is_refused_with_those_it_has():
     with pytest.raises(OpenArmError, match="no arm 'third' in robot 'openarm_v1'; arms: left, right"):
         RobotDescription.load().arm("third")
@@ -67,3 +81,38 @@ def test_arms_that_are_no_mirror_images_are_not_mirrored(robots):
     altered(robots, mirror=[])
     with pytest.raises(OpenArmError, match="no mirror images"):
         RobotDescription.from_folder("mine").mirrored([0.0] * 7)
+
+
+def test_the_table_of_a_scene_is_that_of_the_robot_where_the_scene_says_nothing_else(nearer, monkeypatch):
+    bench = parse_scene({"table": {"x": [0.2, 0.9]}}, "bench.yaml")
+    assert (bench.table.top_z, bench.table.x, bench.table.thickness) == (0.45, (0.2, 0.9), 0.04)
+    assert Scene().table == folder.robot_work().table
+    monkeypatch.setenv(folder.ROBOT, "openarm_v1")
+    assert Scene().table.top_z == 0.40
+
+
+def test_a_scene_in_the_folder_of_the_robot_goes_before_one_of_all_robots(nearer, monkeypatch):
+    own = scene.models_dir() / "robots" / "nearer" / "scenes"
+    assert not own.exists()
+    common = load_scene("empty")
+    monkeypatch.setattr(scene, "models_dir", folder.models_dir)
+    own = folder.models_dir() / "robots" / "nearer" / "scenes"
+    (own / "empty.yaml").write_text("table: {top_z: 0.5}")
+    assert (load_scene("empty").table.top_z, common.table.top_z) == (0.5, 0.45)
+    with pytest.raises(OpenArmError, match="calibration_overhead, calibration_wrist, empty, random"):
+        load_scene("demo")
+
+
+def test_a_robot_that_does_not_say_where_it_works_has_no_scenes(robots, monkeypatch):
+    monkeypatch.setenv(folder.ROBOT, "mine")
+    altered(robots, work=None)
+    with pytest.raises(OpenArmError, match=r"robot\.yaml:work: missing") as error:
+        Scene()
+    assert error.value.code is Code.CONFIG_INVALID
+
+
+def test_a_table_that_stands_in_the_robot_is_refused(robots):
+    work = yaml.safe_load((robots / "robot.yaml").read_text())["work"]
+    altered(robots, work=work | {"least_x": 0.2})
+    with pytest.raises(OpenArmError, match=r"stand in the robot: x is 0\.11, expected at least 0\.2"):
+        folder.load_folder("mine")

@@ -15,13 +15,12 @@ from pydantic import ValidationError
 from openarm_common.config import load_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir, models_dir
+from openarm_common.robot.folder import robot_work
+from openarm_common.robot.work import Table
 from openarm_common.scene.scene import (
     PALETTE,
-    REGION_ABS_Y,
-    REGION_X,
     Scene,
     SceneObject,
-    Table,
     load_scene,
     parse_object,
     parse_scene,
@@ -42,27 +41,27 @@ def refused(data: dict[str, Any]) -> str:
 
 
 def test_every_scene_of_the_suite_is_valid() -> None:
-    files = sorted((models_dir() / "scenes").glob("*.yaml"))
-    assert {"demo", "empty"} <= {file.stem for file in files}
+    files = sorted([*(models_dir() / "scenes").glob("*.yaml"), *models_dir().glob("robots/openarm_v1/scenes/*.yaml")])
+    assert {"demo", "empty", "calibration_wrist"} <= {file.stem for file in files}
     for file in files:
         assert load_scene(file.stem).name == file.stem
         assert load_scene(file) == load_scene(file.stem)
 
 
 def test_demo_has_a_red_cube_for_the_right_arm_and_a_blue_can_for_the_left() -> None:
-    demo = load_scene("demo")
-    assert demo.table == Table(top_z=0.40, x=(0.11, 0.81), y=(-0.60, 0.60))
+    demo, region = load_scene("demo"), robot_work().region
+    assert demo.table == Table(top_z=0.40, x=(0.11, 0.81), y=(-0.60, 0.60), thickness=0.04)
     red, blue = demo.object("red_cube"), demo.object("blue_can")
     assert (red.label, red.shape, red.size) == ("red", "box", (0.05, 0.05, 0.05))
     assert (blue.label, blue.shape, blue.size) == ("blue", "cylinder", (0.066, 0.066, 0.115))
     assert red.position[1] < 0.0 < blue.position[1]
     for item in demo.objects:
-        assert REGION_X[0] <= item.position[0] <= REGION_X[1]
-        assert REGION_ABS_Y[0] <= abs(item.position[1]) <= REGION_ABS_Y[1]
+        assert region.x[0] <= item.position[0] <= region.x[1]
+        assert region.abs_y[0] <= abs(item.position[1]) <= region.abs_y[1]
 
 
 def test_an_object_stands_on_the_table_unless_the_scene_says_otherwise() -> None:
-    table = Table(top_z=0.30)
+    table = robot_work().table.at(0.30)
     standing = SceneObject(**cube())
     assert standing.centre(table) == pytest.approx((0.3, -0.2, 0.325))
     assert SceneObject(**cube(position=[0.3, -0.2, 0.5])).centre(table)[2] == 0.5
@@ -152,7 +151,7 @@ def test_all_faults_are_named_at_once() -> None:
     ("table", "words"),
     [
         ({"x": [0.5, 0.2]}, "table.x: .*low < high"),
-        ({"x": [0.0, 0.6]}, "table.x: .*stand in the pedestal"),
+        ({"x": [0.0, 0.6]}, "table: .*stand in the robot"),
         ({"top_z": 3.0}, "table.top_z"),
         ({"legs": 3}, "table.legs: unknown key"),
     ],
@@ -163,11 +162,11 @@ def test_an_impossible_table_is_refused(table: dict[str, Any], words: str) -> No
 
 
 def test_one_object_can_be_checked_for_a_table() -> None:
-    assert parse_object(cube(), Table(), "spawn").name == "red_cube"
+    assert parse_object(cube(), robot_work().table, "spawn").name == "red_cube"
     with pytest.raises(OpenArmError, match=r"spawn: object 'red_cube' at .* is outside the table"):
-        parse_object(cube(position=[2.0, 0.0]), Table(), "spawn")
+        parse_object(cube(position=[2.0, 0.0]), robot_work().table, "spawn")
     with pytest.raises(OpenArmError, match="spawn:shape"):
-        parse_object(cube(shape="ball"), Table(), "spawn")
+        parse_object(cube(shape="ball"), robot_work().table, "spawn")
 
 
 def test_unknown_scenes_and_objects_list_what_there_is(tmp_path: Path) -> None:
@@ -191,7 +190,7 @@ def test_scenes_are_frozen() -> None:
 
 @pytest.mark.requirement("B-17")
 def test_random_scenes_are_graspable_and_repeatable() -> None:
-    counts, shapes, sides = set(), set(), set()
+    counts, shapes, sides, region = set(), set(), set(), robot_work().region
     for seed in range(200):
         scene = random_scene(seed)
         assert scene == load_scene("random", seed)
@@ -205,8 +204,8 @@ def test_random_scenes_are_graspable_and_repeatable() -> None:
             assert 0.04 <= y <= 0.07
             assert 0.04 <= z <= 0.115
             assert 0.06 <= item.mass_kg <= 0.35
-            assert REGION_X[0] <= item.position[0] <= REGION_X[1]
-            assert REGION_ABS_Y[0] <= abs(item.position[1]) <= REGION_ABS_Y[1]
+            assert region.x[0] <= item.position[0] <= region.x[1]
+            assert region.abs_y[0] <= abs(item.position[1]) <= region.abs_y[1]
         for a, b in itertools.combinations(scene.objects, 2):
             assert np.hypot(a.position[0] - b.position[0], a.position[1] - b.position[1]) >= 0.10
     assert counts == {1, 2, 3, 4}
@@ -232,5 +231,5 @@ def test_the_palette_lies_inside_the_hue_ranges_of_the_detector() -> None:
 
 def test_the_table_defaults_are_a_scene_of_their_own() -> None:
     assert Scene().objects == ()
-    assert Table().centre == pytest.approx((0.46, 0.0))
-    assert Table().extents == pytest.approx((0.70, 1.20, 0.04))
+    assert robot_work().table.centre == pytest.approx((0.46, 0.0))
+    assert robot_work().table.extents == pytest.approx((0.70, 1.20, 0.04))

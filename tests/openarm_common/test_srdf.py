@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Groups, postures and the collision matrix of openarm.srdf, and an SRDF that does not fit its URDF."""
+"""Groups and postures of openarm.srdf, and an SRDF that does not fit its URDF."""
 
 from __future__ import annotations
-
-import importlib.util
-from types import ModuleType
 
 import numpy as np
 import pytest
 
 from openarm_common.errors import OpenArmError
-from openarm_common.resources import models_dir
 from openarm_common.robot.description import RobotDescription
 
 mirror = RobotDescription.load().mirrored
@@ -51,37 +47,6 @@ def test_srdf_home_is_the_observing_posture_and_mirrored(description: RobotDescr
     tcp = description.link_pose("openarm_right_hand_tcp", description.group_state("right_arm", "home"))[:3, 3]
     np.testing.assert_allclose(tcp, [0.41, -0.39, 0.79], atol=0.006)
     assert description.group_state("right_arm", "official_home")["openarm_right_joint4"] == 1.570796
-
-
-@pytest.fixture(scope="module")
-def generator() -> ModuleType:
-    path = models_dir() / "robots" / "openarm_v1" / "generate_srdf.py"
-    spec = importlib.util.spec_from_file_location("generate_srdf", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.mark.requirement("A-74")
-def test_collision_matrix_is_symmetric_and_keeps_what_must_be_checked(
-    description: RobotDescription, generator: ModuleType
-) -> None:
-    allowed = description.allowed_collisions
-    assert {generator.mirrored_pair(pair) for pair in allowed} == set(allowed)
-    assert not allowed & generator.always_checked()
-    assert generator.adjacent_pairs(description) <= allowed
-    assert generator.default_pairs() <= allowed
-    assert len(generator.adjacent_pairs(description)) == 22
-
-
-@pytest.mark.requirement("A-74")
-def test_no_pair_that_is_said_never_to_touch_does(description: RobotDescription, generator: ModuleType) -> None:
-    touching = generator.touching_pairs(description, 3000)
-    never = description.allowed_collisions - generator.adjacent_pairs(description) - generator.default_pairs()
-    assert len(never) > 50
-    assert not never & touching
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ def test_any_robot_can_be_read() -> None:
     robot = RobotDescription.from_urdf(MINI)
     assert (robot.root, robot.name) == ("base", "mini")
     assert robot.links["base"].visual[0].size == (0.1,)
-    assert robot.links["slide"].meshes == ("c",)
+    assert robot.links["slide"].unread == ("c",)
     assert robot.joints["j2"].upper == np.inf
     T = robot.link_pose("follow", {"j1": 0.25})
     np.testing.assert_allclose(T, se3.make(se3.rot_z(1.0 - 2 * 0.25 + 0.5), (1, 0, 0.25)))

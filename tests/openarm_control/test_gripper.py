@@ -87,6 +87,25 @@ def test_an_object_stalls_the_finger_and_is_pressed_on() -> None:
     assert finger.targets[-1] == 0.0
 
 
+@pytest.mark.parametrize("lever", [0.09, -0.09])
+def test_a_hinge_moves_its_finger_as_a_slide_does(lever: float) -> None:
+    lower, upper = sorted((0.0, 0.044 / lever))
+    group = JointGroup(("hinge",), np.array([lower]), np.array([upper]), np.array([10.0]), lever)
+    slide, outcomes = Finger(stop=0.025), list[GripperOutcome]()
+    hinge = GripperFollower(group, GripperConfig(), [0.044 / lever], 2.7)
+    slide.start(0.0)
+    hinge.start(hinge.check(GripperGoal(0.0)), 0.044 / lever, 0.0, outcomes.append)
+    while not slide.outcomes:
+        at, effort = (np.array([value]) for value in (slide.x / lever, slide.effort * lever))
+        target = hinge.update(slide.t_ns, 10 * MS, at, np.array([slide.v / lever]), effort)
+        pressing = hinge.pressing
+        slide.tick()
+        assert target[0] * lever == pytest.approx(slide.targets[-1], abs=1e-9)
+        assert pressing == slide.follower.pressing
+    assert outcomes[0].stalled
+    assert outcomes[0].position * lever == pytest.approx(slide.outcomes[0].position)
+
+
 def test_effort_is_limited_as_asked_and_by_the_gripper() -> None:
     finger = Finger()
     for asked, limit in ((10.0, 10.0), (100.0, 30.0), (0.0, 30.0), (-5.0, 30.0)):
@@ -137,7 +156,7 @@ def test_a_finger_that_never_rests_times_out() -> None:
         (
             {"position": 0.1},
             Code.LIMITS,
-            r"position of finger is 0\.1000 m, out of its limits 0\.000 \(closed\) to 0\.044",
+            r"position of finger is 0\.1000, out of its limits 0\.000 to 0\.044",
         ),
         ({"position": float("nan")}, Code.INVALID_ARGUMENT, "position of finger is nan"),
         ({"position": 0.01, "max_effort": float("inf")}, Code.INVALID_ARGUMENT, "effort of finger is inf"),

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code
-from openarm_common.scene.scene import Table, random_scene
+from openarm_common.robot.folder import robot_work
+from openarm_common.scene.scene import random_scene
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses, arms_behind
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import Trials
@@ -72,7 +73,7 @@ def test_the_judge_of_the_gap_measures_what_mujoco_measures_pair_by_pair() -> No
 
 
 def test_the_gap_of_joint_states_is_that_of_the_simulation_which_they_come_from() -> None:
-    robot, table = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False)), Table()
+    robot, table = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False)), robot_work().table
     home = robot.states.latest()[1]
     arms = arms_behind((), table)
 

@@ -14,7 +14,7 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.scene import Table
+from openarm_common.robot.folder import robot_work
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.verdicts import Evidence
@@ -41,6 +41,9 @@ class Follow:
     trajectory: str
     what: str
     carrying: bool = False
+
+
+HAND = RobotDescription.load().hand("right").parts
 
 
 @dataclass(frozen=True)
@@ -135,8 +138,9 @@ class World(Skills):
         self.on_report: Callable[[Status], None] = lambda status: None
         self.plans: list[Planned | OpenArmError] = []
         self._config = GraspConfig.model_validate({"near": {"enabled": False}, **config})
-        shoulders, looks = {"left": (0.0, 0.15), "right": (0.0, -0.15)}, "right" if self._config.near.enabled else ""
-        self.session = GraspSession(GraspContext(self._config, Table(), shoulders, looks))
+        shoulders = {"left": (0.0, 0.15), "right": (0.0, -0.15)}
+        looks = {"right": "wrist"} if self._config.near.enabled else {}
+        self.session = GraspSession(GraspContext(self._config, robot_work().table, HAND, shoulders, looks))
         self.deadline_ns = 0
         self.robot = self  # type: ignore[assignment]
         self._target, self._label, self._line = np.zeros(3), "", np.zeros(3)
@@ -196,7 +200,7 @@ class World(Skills):
     def stop_observing(self) -> None:
         pass
 
-    def expect_near(self) -> None:
+    def expect_near(self, camera: str) -> None:
         pass
 
     def call(self, call: Call) -> None:
@@ -212,7 +216,7 @@ class World(Skills):
         self.call(Wait(duration))
         self.pass_time(duration)
 
-    async def observe(self, count: int, *, near: bool = False) -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> Frames:
         self.call(Observe(count, near))
         seen = self.frames(count)
         if not near:
@@ -288,8 +292,8 @@ class World(Skills):
     def lifted(self, label: str) -> None:
         self.objects.pop(label)
 
-    async def follow_and_grip(self, arm: str, trajectory: object, what: str, *, position: float, how: str) -> None:
-        await self.grip(arm, position, how)
+    async def follow_and_grip(self, arm: str, trajectory: object, what: str, how: str) -> None:
+        await self._grip(arm, HAND.opening if how == "open" else 0.0, how)
         await self.follow(arm, trajectory, what)
 
     async def move_linear(self, arm: str, T_base_tcp: np.ndarray, what: str) -> None:
@@ -303,7 +307,16 @@ class World(Skills):
     def aperture(self, arm: str) -> float:
         return self.gap
 
-    async def grip(self, arm: str, position: float, what: str, effort: float = 0.0) -> None:
+    def is_open(self, arm: str) -> bool:
+        return self.gap >= 2.0 * (HAND.opening - self._config.hand.open_tolerance)
+
+    async def open(self, arm: str, what: str) -> None:
+        await self._grip(arm, HAND.opening, what)
+
+    async def close(self, arm: str, what: str, force: float = 0.0) -> None:
+        await self._grip(arm, 0.0, what)
+
+    async def _grip(self, arm: str, position: float, what: str) -> None:
         self.call(Grip(arm, position, what))
         self.pass_time(0.6)
         self.move_gripper(position)

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.config import GraspConfig, HandConfig
+from openarm_common.robot.description import RobotDescription
+from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import (
     held_box,
     obstacle_boxes,
@@ -24,6 +25,7 @@ from openarm_grasp.planning.candidates import (
 
 TABLE = 0.40
 CONFIG = GraspConfig()
+HAND = RobotDescription.load().hand("right").parts
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -44,7 +46,7 @@ boxes = st.builds(
 @given(boxes)
 @pytest.mark.requirement("B-42")
 def test_the_best_grasp_comes_from_straight_above(target):
-    best = propose(target, CONFIG)[0]
+    best = propose(target, CONFIG, HAND)[0]
     assert best.tilt == 0.0
     assert best.T_base_tcp[:3, 2] @ DOWN >= 0.99
 
@@ -52,7 +54,7 @@ def test_the_best_grasp_comes_from_straight_above(target):
 @given(boxes)
 @pytest.mark.requirement("B-42")
 def test_each_tilt_leans_by_its_angle(target):
-    for c in propose(target, CONFIG):
+    for c in propose(target, CONFIG, HAND):
         assert c.T_base_tcp[:3, 2] @ DOWN == pytest.approx(np.cos(c.tilt))
 
 
@@ -60,7 +62,7 @@ def test_each_tilt_leans_by_its_angle(target):
 @pytest.mark.requirement("B-43")
 def test_opening_axis_is_horizontal_and_parallel_to_an_edge(target):
     edges = target.T_base_object[:2, :2]
-    for c in propose(target, CONFIG):
+    for c in propose(target, CONFIG, HAND):
         y_tool = c.T_base_tcp[:3, 1]
         assert abs(y_tool[2]) < 1e-9
         assert np.max(np.abs(y_tool[:2] @ edges)) > 1.0 - 1e-9
@@ -69,7 +71,7 @@ def test_opening_axis_is_horizontal_and_parallel_to_an_edge(target):
 @given(boxes)
 @pytest.mark.requirement("B-44")
 def test_tool_z_is_the_approach_and_tool_y_spans_the_width(target):
-    for c in propose(target, CONFIG):
+    for c in propose(target, CONFIG, HAND):
         R = c.T_base_tcp[:3, :3]
         assert pytest.approx(np.eye(3), abs=1e-9) == R @ R.T
         assert np.linalg.det(R) == pytest.approx(1.0)
@@ -82,7 +84,7 @@ def test_tool_z_is_the_approach_and_tool_y_spans_the_width(target):
 @given(boxes)
 @pytest.mark.requirement("B-45", "B-46")
 def test_pregrasp_is_straight_behind_the_grasp(target):
-    for c in propose(target, CONFIG):
+    for c in propose(target, CONFIG, HAND):
         assert 0.05 <= np.linalg.norm(c.approach_offset) <= 0.08
         pregrasp = c.T_base_tcp[:3, 3] + c.approach_offset
         if c.tilt == 0.0:
@@ -94,7 +96,7 @@ def test_pregrasp_is_straight_behind_the_grasp(target):
 @pytest.mark.requirement("B-46")
 def test_pregrasp_distance_of_6_cm_is_a_parameter():
     config = GraspConfig.model_validate({"approach": {"pregrasp_distance": 0.06}})
-    top_down = propose(box(), config)[0]
+    top_down = propose(box(), config, HAND)[0]
     assert top_down.approach_offset[2] == pytest.approx(0.06)
 
 
@@ -123,19 +125,19 @@ def test_pregrasp_distance_must_exceed_the_path_tolerance():
     ],
 )
 def test_tcp_height_clears_tips_and_palm(height, tilt_deg, expected):
-    assert tcp_height(height, np.radians(tilt_deg), HandConfig()) == pytest.approx(expected)
+    assert tcp_height(height, np.radians(tilt_deg), HAND) == pytest.approx(expected)
 
 
 @given(boxes)
 def test_tcp_stands_over_the_centre_and_above_the_table(target):
-    for c in propose(target, CONFIG):
+    for c in propose(target, CONFIG, HAND):
         assert c.T_base_tcp[:2, 3] == pytest.approx(target.p_base[:2])
         assert c.T_base_tcp[2, 3] >= TABLE + 0.012
         assert target.top - c.T_base_tcp[2, 3] <= 0.045 + 1e-9
 
 
 def test_a_square_box_offers_both_edges_flips_tilts_and_leans():
-    found = propose(box(size=(0.05, 0.05, 0.05)), CONFIG)
+    found = propose(box(size=(0.05, 0.05, 0.05)), CONFIG, HAND)
     assert len(found) == 2 * 2 * (1 + 3 * 2)
     assert len({c.id for c in found}) == len(found)
 
@@ -148,7 +150,7 @@ def can(x=0.26, y=-0.2, yaw=0.0, width=0.06) -> Detection:
 @pytest.mark.requirement("B-43")
 def test_what_is_round_is_taken_from_any_side(yaw):
     """Whatever yaw the camera gave it: a hand stands across every 30 degrees."""
-    found = propose(can(yaw=yaw), CONFIG)
+    found = propose(can(yaw=yaw), CONFIG, HAND)
     assert len({c.id for c in found}) == len(found) == 6 * 2 * (1 + 3 * 2)
     across = {round(np.degrees(np.arctan2(*c.T_base_tcp[[1, 0], 1]))) % 360 for c in found if c.tilt == 0.0}
     assert across == set(range(0, 360, 30))
@@ -158,28 +160,28 @@ def test_what_is_round_is_taken_from_any_side(yaw):
 @pytest.mark.requirement("B-43")
 def test_the_steps_around_what_is_round_are_a_parameter():
     config = GraspConfig.model_validate({"approach": {"round_step_deg": 45.0, "tilts_deg": [0.0]}})
-    assert [c.id for c in propose(can(), config)] == [f"red/{a}{f}/tilt0" for a in (0, 45, 90, 135) for f in "+-"]
+    assert [c.id for c in propose(can(), config, HAND)] == [f"red/{a}{f}/tilt0" for a in (0, 45, 90, 135) for f in "+-"]
 
 
 def test_something_round_and_too_wide_is_refused():
     with pytest.raises(OpenArmError, match="80 mm × 80 mm") as error:
-        propose(can(width=0.08), CONFIG)
+        propose(can(width=0.08), CONFIG, HAND)
     assert error.value.code is Code.TOO_WIDE
 
 
 def test_tilts_are_tried_in_order():
-    tilts = [c.tilt for c in propose(box(), CONFIG)]
+    tilts = [c.tilt for c in propose(box(), CONFIG, HAND)]
     assert tilts == sorted(tilts)
 
 
 def test_leaning_away_from_the_shoulder_comes_first():
-    found = propose(box(x=0.3, y=-0.15, yaw=np.pi / 2), CONFIG, shoulder_xy=(0.0, -0.15))
+    found = propose(box(x=0.3, y=-0.15, yaw=np.pi / 2), CONFIG, HAND, shoulder_xy=(0.0, -0.15))
     leaning = next(c for c in found if c.tilt > 0.0 and abs(c.T_base_tcp[0, 2]) > 0.1)
     assert leaning.T_base_tcp[0, 2] > 0.0
 
 
 def test_score_is_the_sum_of_its_parts():
-    for c in propose(box(), CONFIG):
+    for c in propose(box(), CONFIG, HAND):
         assert c.score == pytest.approx(sum(c.parts.values()))
         assert set(c.parts) == {"tilt", "width", "side", "room"}
 
@@ -189,31 +191,31 @@ def test_hands_whose_fingers_have_room_come_first():
     """A block stands close to the narrow side, across which the hand would close by itself: it turns by a quarter."""
     alone = box(yaw=0.0, size=(0.045, 0.05, 0.05))
     neighbour = box(x=alone.p_base[0] + 0.075, yaw=0.0, size=(0.05, 0.05, 0.05), label="blue")
-    assert "/x" in propose(alone, CONFIG)[0].id
-    offered = propose(alone, CONFIG, others=(neighbour,))
+    assert "/x" in propose(alone, CONFIG, HAND)[0].id
+    offered = propose(alone, CONFIG, HAND, others=(neighbour,))
     assert "/y" in offered[0].id
     rooms = {c.id.split("/")[1][0]: c.parts["room"] for c in offered}
     assert rooms["y"] == 0.0
     assert rooms["x"] < -0.15  # the finger would stand in the block
-    assert len(offered) == len(propose(alone, CONFIG))  # the planner has the last word
+    assert len(offered) == len(propose(alone, CONFIG, HAND))  # the planner has the last word
 
 
 def test_only_the_narrow_edge_of_a_wide_box_is_grasped():
-    found = propose(box(size=(0.05, 0.09, 0.05)), CONFIG)
+    found = propose(box(size=(0.05, 0.09, 0.05)), CONFIG, HAND)
     assert {c.width for c in found} == {0.05}
 
 
 @pytest.mark.requirement("B-17")
 def test_too_wide_states_widths_and_limit():
     with pytest.raises(OpenArmError) as error:
-        propose(box(size=(0.08, 0.09, 0.05)), CONFIG)
+        propose(box(size=(0.08, 0.09, 0.05)), CONFIG, HAND)
     assert error.value.code is Code.TOO_WIDE
     assert "80 mm × 90 mm" in error.value.message
     assert "70 mm" in error.value.message
 
 
 def test_a_70_mm_side_measured_a_millimetre_too_wide_is_still_grasped():
-    assert propose(box(size=(0.071, 0.071, 0.05)), CONFIG)
+    assert propose(box(size=(0.071, 0.071, 0.05)), CONFIG, HAND)
 
 
 def test_target_box_ends_above_the_table_and_at_the_top():
@@ -233,7 +235,7 @@ def test_obstacles_are_inflated_sideways_and_upwards():
 
 
 def test_held_box_is_the_target_seen_from_the_hand():
-    target, c = box(), propose(box(), CONFIG)[0]
+    target, c = box(), propose(box(), CONFIG, HAND)[0]
     held = held_box(target, c, CONFIG)
     assert c.T_base_tcp @ held.T_frame_box == pytest.approx(target_box(target, CONFIG).T_frame_box)
     # Centred between the fingers.

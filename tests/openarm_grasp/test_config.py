@@ -11,6 +11,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 import openarm_grasp
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import ROBOT
 from openarm_grasp.config import GraspConfig
 
 
@@ -46,13 +48,23 @@ def test_defaults_are_those_of_the_requirements(section, key, value):
     assert getattr(getattr(GraspConfig(), section), key) == value
 
 
+def test_regions_are_those_of_the_robot_of_the_process(nearer, monkeypatch):
+    config = GraspConfig()
+    assert (config.place.region_x, config.place.region_abs_y) == ((0.15, 0.35), (0.05, 0.45))
+    monkeypatch.setenv(ROBOT, "openarm_v1")
+    config = GraspConfig()
+    assert (config.place.region_x, config.place.region_abs_y) == ((0.16, 0.36), (0.06, 0.42))
+    assert (config.hand_over.x, config.hand_over.abs_y) == ((0.20, 0.32), 0.03)
+
+
 @pytest.mark.parametrize(("pregrasp", "clear"), [(None, True), (0.06, False)])
 @pytest.mark.requirement("B-45", "B-48")
 def test_by_default_the_open_fingers_begin_farther_above_any_object_than_they_may_be_off_their_path(pregrasp, clear):
     """Of the 5 to 8 cm that are allowed; a tall object reaches deepest between the fingers, up to the palm."""
     config = GraspConfig.model_validate({"approach": {} if pregrasp is None else {"pregrasp_distance": pregrasp}})
     assert 0.05 <= config.approach.pregrasp_distance <= 0.08
-    above = config.approach.pregrasp_distance - config.hand.palm_depth - config.hand.tip_clearance
+    hand = RobotDescription.load().hand("right").parts
+    above = config.approach.pregrasp_distance - hand.palm_depth - hand.tip_clearance
     assert (above > config.approach.path_tolerance) is clear
 
 

@@ -48,7 +48,7 @@ class Robot:
             raise OpenArmError(self.faults.pop(0), "the other arm is in the way")
         return "plan"
 
-    async def observe(self, count: int, *, near: bool = False) -> str:
+    async def observe(self, count: int, *, near: str = "") -> str:
         self.looks += 1
         return "frames"
 

@@ -30,13 +30,13 @@ def test_a_grasp_goes_through_all_states_in_order(world):
 def test_the_hand_opens_on_the_way_to_the_pregrasp(world):
     real, together = world.follow_and_grip, []
 
-    async def follow_and_grip(arm, trajectory, what, **fingers):
-        together.append((trajectory, fingers["position"]))
-        await real(arm, trajectory, what, **fingers)
+    async def follow_and_grip(arm, trajectory, what, how):
+        together.append((trajectory, how))
+        await real(arm, trajectory, what, how)
 
     world.follow_and_grip = follow_and_grip
     world.grasp()
-    assert together == [("transfer", 0.044)]
+    assert together == [("transfer", "open")]
 
 
 @pytest.mark.requirement("B-52", "B-53", "B-54")

@@ -13,14 +13,16 @@ from hypothesis import strategies as st
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene.scene import Table
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import robot_work
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import GraspCandidate, propose
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, yaw_offsets
 
 CONFIG = GraspConfig()
+HAND = RobotDescription.load().hand("right").parts
 SHOULDERS = {"left": (0.0, 0.15), "right": (0.0, -0.15)}
-TABLE = Table()
+TABLE = robot_work().table
 
 
 def box(x=0.26, y=-0.2, yaw=0.3, size=(0.04, 0.06, 0.05), label="red") -> Detection:
@@ -30,7 +32,7 @@ def box(x=0.26, y=-0.2, yaw=0.3, size=(0.04, 0.06, 0.05), label="red") -> Detect
 @given(st.floats(-3.0, 3.0), st.integers(0, 27), st.floats(0.16, 0.36), st.floats(-0.42, -0.06))
 def test_the_object_keeps_its_place_in_the_hand(yaw, which, x, y):
     target = box(yaw=yaw)
-    candidate = propose(target, CONFIG)[which % 14]
+    candidate = propose(target, CONFIG, HAND)[which % 14]
     T_tcp_object = se3.inverse(candidate.T_base_tcp) @ target.T_base_object
     for t in place_targets(target, candidate, [np.array([x, y])], CONFIG):
         T_base_object = t.T_base_tcp @ T_tcp_object
@@ -43,7 +45,7 @@ def test_the_object_keeps_its_place_in_the_hand(yaw, which, x, y):
 
 
 def test_the_hand_comes_from_above_and_leaves_along_its_own_axis():
-    candidate = propose(box(), CONFIG)[-1]
+    candidate = propose(box(), CONFIG, HAND)[-1]
     assert candidate.tilt > 0.7
     for t in place_targets(box(), candidate, [np.array([0.2, -0.3])], CONFIG):
         assert t.approach_offset == pytest.approx((0.0, 0.0, CONFIG.approach.pregrasp_distance))
@@ -53,7 +55,7 @@ def test_the_hand_comes_from_above_and_leaves_along_its_own_axis():
 
 def test_small_turns_of_every_spot_come_before_large_turns_of_the_first():
     spots = [np.array([0.2, -0.3]), np.array([0.3, -0.3])]
-    ids = [t.id for t in place_targets(box(), propose(box(), CONFIG)[0], spots, CONFIG)]
+    ids = [t.id for t in place_targets(box(), propose(box(), CONFIG, HAND)[0], spots, CONFIG)]
     assert ids[0] == "spot0/yaw+0"
     assert set(ids[:6]) == {f"spot{i}/yaw{y}" for i in (0, 1) for y in ("+0", "+30", "-30")}
     assert len(ids) == 24
@@ -68,7 +70,7 @@ def hands_there(target: Detection, candidate: GraspCandidate, yaw: float | None)
 @given(st.sampled_from([box(), box(size=(0.05, 0.05, 0.05)), replace(box(size=(0.05, 0.05, 0.05)), round=True)]),
        st.sampled_from([None, 0.8]), st.integers(0, 27))  # fmt: skip
 def test_grasps_with_which_the_hand_could_not_stand_otherwise_are_left_out(target, yaw, which):
-    offered = propose(target, CONFIG)
+    offered = propose(target, CONFIG, HAND)
     failed = offered[which]
     left = other_grasps(offered, failed, Code.UNREACHABLE, target, yaw)
     there = hands_there(target, failed, yaw)
@@ -78,7 +80,7 @@ def test_grasps_with_which_the_hand_could_not_stand_otherwise_are_left_out(targe
 
 @pytest.mark.parametrize(("target", "yaw", "rounds"), [(box(), None, 7), (box(), 0.8, 14)])
 def test_every_way_to_stand_there_is_tried_once(target, yaw, rounds):
-    left = propose(target, CONFIG)
+    left = propose(target, CONFIG, HAND)
     for _ in range(rounds):
         assert left
         left = other_grasps(left, left[0], Code.IN_COLLISION, target, yaw)
@@ -86,7 +88,7 @@ def test_every_way_to_stand_there_is_tried_once(target, yaw, rounds):
 
 
 def test_a_search_that_failed_says_nothing_about_other_holds():
-    offered = propose(box(), CONFIG)
+    offered = propose(box(), CONFIG, HAND)
     left = other_grasps(offered, offered[0], Code.NO_PLAN, box(), None)
     assert len(left) == 21
     assert not any(c.id.startswith("red/x+/") for c in left)
@@ -94,19 +96,19 @@ def test_a_search_that_failed_says_nothing_about_other_holds():
 
 def test_what_is_round_looks_the_same_at_any_yaw():
     target = replace(box(size=(0.05, 0.05, 0.05)), round=True)
-    ways = place_targets(target, propose(target, CONFIG)[0], [np.array([0.2, -0.3])], CONFIG, yaw=0.8)
+    ways = place_targets(target, propose(target, CONFIG, HAND)[0], [np.array([0.2, -0.3])], CONFIG, yaw=0.8)
     assert len(ways) == 12
 
 
 def test_scores_follow_the_order():
-    targets = place_targets(box(), propose(box(), CONFIG)[0], [np.array([0.2, -0.3])], CONFIG)
+    targets = place_targets(box(), propose(box(), CONFIG, HAND)[0], [np.array([0.2, -0.3])], CONFIG)
     scores = [t.score for t in targets]
     assert scores == sorted(scores, reverse=True)
     assert len(set(scores)) == 2  # small turns, large turns
 
 
 def test_a_failed_spot_comes_last_and_a_failed_turn_of_the_only_spot_too():
-    spots, candidate = [np.array([0.2, -0.3]), np.array([0.3, -0.3])], propose(box(), CONFIG)[0]
+    spots, candidate = [np.array([0.2, -0.3]), np.array([0.3, -0.3])], propose(box(), CONFIG, HAND)[0]
     first = place_targets(box(), candidate, spots, CONFIG)
     again = place_targets(box(), candidate, spots, CONFIG, used=first[:1])
     assert {t.id.split("/")[0] for t in again[:12]} == {"spot1"}

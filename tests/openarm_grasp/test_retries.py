@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import propose
 from openarm_grasp.planning.retries import FailedGrasp, ways
@@ -22,6 +23,7 @@ from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from tests.openarm_grasp.scripted import World, standing
 
 CONFIG = GraspConfig()
+HAND = RobotDescription.load().hand("right").parts
 HALF_TURN = se3.rot_z(np.pi)
 
 
@@ -164,9 +166,9 @@ def test_what_is_refused_elsewhere_is_asked_for_again_last():
 def test_what_changes_first_follows_from_the_cause(code, up):
     """A hand that met something stays higher; fingers that lost or missed the object go to its other sides."""
     target = cube(0.3, 0)
-    first = propose(target, CONFIG)[0]
+    first = propose(target, CONFIG, HAND)[0]
     failed = FailedGrasp.of(code, "right", first, target)
-    second = ways(target, CONFIG, (failed,)).fresh[0]
+    second = ways(target, CONFIG, HAND, (failed,)).fresh[0]
     assert second.T_base_tcp[2, 3] - first.T_base_tcp[2, 3] == pytest.approx(up)
     assert second.T_base_tcp[:3, 1] @ first.T_base_tcp[:3, 1] == pytest.approx(0.0, abs=0.1)
     assert second.tilt == 0.0

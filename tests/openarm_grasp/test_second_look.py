@@ -70,7 +70,7 @@ def test_a_second_look_that_does_not_help_changes_nothing(what: str, worlds, box
     world = worlds(box("red", 0.26, -0.2), near={"enabled": True})
     real = world.observe
 
-    async def observe(count: int, *, near: bool = False) -> Frames:
+    async def observe(count: int, *, near: str = "") -> Frames:
         seen = await real(count, near=near)
         if not near:
             return seen
@@ -95,7 +95,7 @@ def test_a_second_look_corrects_the_grasp_before_the_hand_goes_down(worlds, box)
     world = worlds(box("red", 0.26, -0.2), near={"enabled": True})
     real = world.observe
 
-    async def observe(count: int, *, near: bool = False) -> Frames:
+    async def observe(count: int, *, near: str = "") -> Frames:
         seen = await real(count, near=near)
         if not near:
             return seen

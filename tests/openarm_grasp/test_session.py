@@ -10,6 +10,7 @@ import pytest
 
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Sighting
@@ -26,7 +27,9 @@ def kept(arm: str, label: str) -> Grasp:
     T = np.eye(4)
     T[:3, 3] = (0.26, 0.2, 0.425)
     target = Detection(label, 1.0, T, np.full(3, 0.05))
-    return Grasp(arm, Sighting(target, (), 0), propose(target, GraspConfig())[0], ())
+    return Grasp(
+        arm, Sighting(target, (), 0), propose(target, GraspConfig(), RobotDescription.load().hand(arm).parts)[0], ()
+    )
 
 
 @pytest.fixture

@@ -35,7 +35,6 @@ def test_links_are_sorted_by_the_tree_alone(right: Arm, six: RobotDescription) -
     links = right.robot.arm
     assert links.gripper == {"openarm_right_left_finger", "openarm_right_right_finger"}
     assert links.hand == links.gripper | {"openarm_right_hand", "openarm_right_hand_tcp"}
-    assert links.gripper_joints == ("openarm_right_finger_joint1",)
     assert "openarm_body_link0" in links.fixed
     assert "openarm_right_link0" in links.fixed
     assert "openarm_right_link1" in links.moving

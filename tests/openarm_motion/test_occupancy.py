@@ -109,7 +109,7 @@ def test_octree_cell_at_the_gripper_does_not_hold_the_arm(right: Arm, home: dict
 def test_a_hand_may_back_off_along_cells_next_to_it_but_not_into_them(right: Arm, home: dict[str, float]) -> None:
     """The steps of an object's cells come a little nearer to fingers that leave it than they were at the start."""
     T = se3.make(se3.rotation_from_z_y((0.25, 0, -1), (1, 0, 0)), (0.349, -0.191, 0.468))
-    opened = right.with_gripper(home, right.config.planning.gripper_open)
+    opened = right.with_gripper(home, right.opened)
     known = Environment(map=seen((0.37, -0.19, 0.51)))
     q = next(s.q for s in right.inverse.solutions(T, 0.05) if not right.scene(opened, straight=True).collides(s.q))
     scene = right.scene(opened, straight=True, environment=known)

@@ -3,17 +3,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from benchmarks.robot_models import ABSENT, ROBOTS, TrueMeshes, example_robots, load_arm, states_of
 from benchmarks.robot_problems import FAMILIES, problems
 from openarm_common import se3
-from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision.fast import FastScene
-from openarm_motion.collision.robot_meshes import load_robot
 from openarm_motion.collision.solids import box_from
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.moves import RequestBoxes, to_pose, to_pose_on_line
@@ -100,17 +96,3 @@ def test_problems_are_solved_and_no_path_touches_the_triangles_of_the_meshes(nam
             path = FastPlanner().plan(arm.query(scene, now, problem.goals, 20.0)).waypoints
             hits = judge.around(problem.obstacles)
             assert not any(hits(q) for q in states_of(path, 0.02)), family
-
-
-def test_a_mesh_of_an_unknown_package_is_refused_by_name(tmp_path: Path) -> None:
-    urdf = tmp_path / "r.urdf"
-    urdf.write_text(
-        '<robot name="r"><link name="a"><collision><geometry><mesh filename="package://nobody/a.stl"/>'
-        "</geometry></collision></link></robot>",
-        encoding="utf-8",
-    )
-    with pytest.raises(OpenArmError, match="'nobody' has no folder; packages with one: none") as caught:
-        load_robot(urdf)
-    assert caught.value.code == Code.CONFIG_INVALID
-    with pytest.raises(OpenArmError, match="there is no file"):
-        load_robot(tmp_path / "none.urdf")

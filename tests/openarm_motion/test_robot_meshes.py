@@ -14,13 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common import se3
+from openarm_common.robot.convex import convex_parts, hull_of
 from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.hull_kernels import hull_separation
-from openarm_motion.collision.hulls import Hull, convex_parts, directions, hull_of
+from openarm_motion.collision.hulls import Hull, directions
 from openarm_motion.collision.robot import CollisionRobot
-from openarm_motion.collision.robot_meshes import load_robot
 from openarm_motion.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE
 from openarm_motion.collision.solids import Mesh, box_from
 from openarm_motion.kinematics.chain import ArmKinematics
@@ -69,7 +69,7 @@ def mesh_robot(folder: Path, links: Mapping[str, Boxes], joints: Sequence[str]) 
         )
     path = folder / "robot.urdf"
     path.write_text(f'<robot name="r">{"".join(parts)}</robot>', encoding="utf-8")
-    return load_robot(path)
+    return RobotDescription.from_files(path)
 
 
 def arm_of(description: RobotDescription) -> CollisionRobot:

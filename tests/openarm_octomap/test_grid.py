@@ -335,3 +335,19 @@ def test_points_that_are_not_finite_mark_nothing() -> None:
     points = np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [1e9, 0, 0]], np.float32)
     update = grid.integrate([CloudScan(points, np.array([0.1, 0.0, 0.3]))], 0)
     assert (update.valid, update.ends, grid.counts()["occupied"]) == (0, 0, 0)
+
+
+def test_a_map_of_another_robot_is_refused_and_leaves_the_map_as_it_was(tmp_path, nearer) -> None:
+    other, mine = (
+        Mapper(RobotDescription.load(name), GridConfig(**SMALL), FilterConfig(enabled=False), FieldConfig())
+        for name in ("openarm_v1", nearer)
+    )
+    other.clear_box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1), OCCUPIED)
+    nodes = other.save(tmp_path / "map.ot")
+    assert other.load(tmp_path / "map.ot")[0] == nodes
+    with pytest.raises(OpenArmError, match=r"map\.ot is of robot 'openarm_v1', expected 'nearer'"):
+        mine.load(tmp_path / "map.ot")
+    assert not np.any(mine.snapshot({"states"}).states == OCCUPIED)
+    text = (tmp_path / "map.ot").read_bytes().replace(b"# robot openarm_v1\n", b"")
+    (tmp_path / "foreign.ot").write_bytes(text)  # as other programs write it
+    assert mine.load(tmp_path / "foreign.ot")[0] == nodes

@@ -13,7 +13,8 @@ from benchmarks.localization import Studio
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene.scene import Table, random_scene
+from openarm_common.robot.folder import robot_work
+from openarm_common.scene.scene import random_scene
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
 from openarm_perception.detection.pipeline import Pipeline
 from openarm_perception.detection.robot import RobotConfig, RobotFinder
@@ -70,7 +71,7 @@ class Eye:
     """A watch, and what its camera sees."""
 
     def __init__(self, images: Images, camera: str, seed: int, *, looking: bool = False, **config: float) -> None:
-        self.view, self.table = images.of(camera, seed, looking), Table()
+        self.view, self.table = images.of(camera, seed, looking), robot_work().table
         self.pipeline = images.studio.pipeline(camera, self.table)
         self.watch = CameraWatch(WatchConfig(**config), self.pipeline.localizer.limits, self.view.intrinsics)
         self._t_ns = 0

@@ -19,7 +19,7 @@ from pydantic import Field
 from openarm_bringup.bags.about import about
 from openarm_bringup.bags.recordings import Recordings
 from openarm_bringup.bags.ring import Moment, Ring
-from openarm_bringup.bags.ros.listener import FLIGHT, FLIGHT_ON_DEMAND, Listener
+from openarm_bringup.bags.ros.listener import FLIGHT, Listener, flight_on_demand
 from openarm_bringup.supervision import runs
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
@@ -42,7 +42,7 @@ class FlightRecorderConfig(Config):
     image_rate: float = Field(default=5.0, ge=0.0, le=60.0, description="of each camera, whole frames, Hz; 0: all")
     topics: tuple[str, ...] = Field(default=FLIGHT, description="regular expressions of topic names")
     on_demand: tuple[str, ...] = Field(
-        default=FLIGHT_ON_DEMAND,
+        default_factory=flight_on_demand,
         description="topics that are made for their subscribers: kept while another node subscribes",
     )
     folder: str = Field(default="", description="of the recordings; empty: recordings/ of the run")

@@ -20,30 +20,36 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from openarm_bringup.bags.bag import Message, Topic
 from openarm_bringup.bags.losses import Arrivals
 from openarm_bringup.messages import interface
+from openarm_common.camera.cameras import depth_cameras, hand_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import offered_qos
 
-#: What the profiles record: regular expressions of whole topic names.
-_IMAGES = r"/(overhead|wrist)/(color|depth)/(image_raw|camera_info)"
 _ROBOT = "/joint_states|/tf|/tf_static|/clock|/robot_description"
-_CAMERA = (_IMAGES, _ROBOT)
-PROFILES: Mapping[str, tuple[str, ...]] = {
-    "camera": _CAMERA,
-    "grasp": (
-        *_CAMERA,
-        r"/detections_2d|/detections_3d|/grasp/.*|/motion/.*|/.*/controller_state|/diagnostics|/sim/ground_truth/.*",
-    ),
-    "all": (".*",),
-}
-#: What the flight recorder keeps, and what it keeps while another node subscribes: these are made for subscribers only.
+_REQUESTS = r"/detections_2d|/detections_3d|/grasp/.*|/motion/.*|/.*/controller_state|/diagnostics|/sim/ground_truth/.*"
+#: What the flight recorder keeps.
 FLIGHT = (_ROBOT, r"/grasp/.*|/motion/.*|/diagnostics|/octomap_binary")
-FLIGHT_ON_DEMAND = (_IMAGES, r"(/wrist)?/detections_[23]d", r"/.*_controller/controller_state")
 #: Not recorded by a profile: a replay would be taken for the simulation or for a parameter service.
 _NEVER = r".*/_action/.*|/parameter_events|/rosout"
 #: Periods of all cameras in which streams of a frame may be apart.
 _PERIODS = 32
 #: What rosbag2 writes for "no limit".
 _NO_LIMIT = QosTime(9223372036, 854775807)
+
+
+def _images() -> str:
+    return rf"/({'|'.join(depth_cameras())})/(color|depth)/(image_raw|camera_info)"
+
+
+def profiles() -> Mapping[str, tuple[str, ...]]:
+    """Return what the profiles record: regular expressions of whole topic names."""
+    camera = (_images(), _ROBOT)
+    return {"camera": camera, "grasp": (*camera, _REQUESTS), "all": (".*",)}
+
+
+def flight_on_demand() -> tuple[str, ...]:
+    """Return what the flight recorder keeps while another node subscribes: made for subscribers only."""
+    detections = rf"(/({'|'.join(hand_cameras())}))?/detections_[23]d"
+    return (_images(), detections, r"/.*_controller/controller_state")
 
 
 #: Given a message as CDR and what is known of it.

@@ -16,13 +16,11 @@ from openarm_interfaces.srv import ConfirmPlan, ResetWorld
 from openarm_bringup.ros.stop_client import latch, release
 from openarm_bringup.view.ros.layers import Layer, makers
 from openarm_bringup.view.server import Confirmation, Item, Order, Reset
-from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.cameras import load_cameras, table_camera
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.client import BackgroundNode, ContextNode
 
-#: Camera whose cloud is shown.
-CLOUD_CAMERA = "overhead"
 _TICK_S = 0.02
 _PICK_S = 900.0
 _ANSWER_S = 30.0
@@ -44,7 +42,7 @@ class GraphView(ContextNode):
         self.description = RobotDescription.load()
         self.cameras = tuple(load_cameras().values())
         self._on_item, self._on_end = on_item, on_end
-        self._makers = makers(self.description, self.cameras, CLOUD_CAMERA)
+        self._makers = makers(self.description, self.cameras, table_camera())
         self._wanted: frozenset[str] = frozenset()
         self._ask = BackgroundNode("openarm_view", timeout=timeout)
         self._urgent = BackgroundNode("openarm_view_stop", timeout=timeout)  # nothing else can hold it up

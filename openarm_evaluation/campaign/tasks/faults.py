@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from openarm_common.camera.cameras import detector_nodes, table_camera
 from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import robot_work
 from openarm_common.scene.scene import Scene, SceneObject
-from openarm_evaluation.campaign.tasks.task import FaultPlan, Task, nominal
+from openarm_evaluation.campaign.tasks.task import FaultPlan, Task, nominal, past, within
 
 _NOTHING_HELD = (Code.GRASP_MISSED, Code.GRASP_LOST)
 #: The hand is off its plan: it meets the object, misses it, or is stopped.
@@ -42,10 +44,11 @@ Maker = Callable[[Task, np.random.Generator], Task]
 
 
 def _fault(name: str, *codes: Code, when: str = "", until_attempt: int = 0, **parameters: Any) -> Maker:
-    """Return a maker of a fault with fixed parameters; a pair (low, high) is drawn from."""
+    """Return a maker of a fault; of parameters, a pair (low, high) is drawn from, and what can be called is."""
 
     def make(task: Task, rng: np.random.Generator) -> Task:
-        drawn = {k: float(rng.uniform(*v)) if isinstance(v, tuple) else v for k, v in parameters.items()}
+        known = {k: v() if callable(v) else v for k, v in parameters.items()}
+        drawn = {k: float(rng.uniform(*v)) if isinstance(v, tuple) else v for k, v in known.items()}
         return replace(task, fault=FaultPlan(name, drawn, when, until_attempt), codes=codes or (Code.OK,))
 
     return make
@@ -61,7 +64,7 @@ def _nudged(when: str) -> Maker:
 def _missed(task: Task, rng: np.random.Generator) -> Task:
     share = round(float(rng.uniform(0.2, 0.5)), 3)
     faults = (f"faults.miss_share={share}", f"faults.seed={task.seed}")
-    return replace(task, sets=tuple(f"{node}.{fault}" for node in ("detector", "wrist_detector") for fault in faults))
+    return replace(task, sets=tuple(f"{node}.{fault}" for node in detector_nodes().values() for fault in faults))
 
 
 def _plan_fails(task: Task, rng: np.random.Generator) -> Task:
@@ -69,7 +72,7 @@ def _plan_fails(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _depth_patch(task: Task, rng: np.random.Generator) -> Task:
-    parameters = {"camera": "overhead", "u": int(rng.integers(150, 400)), "v": int(rng.integers(120, 300))}
+    parameters = {"camera": table_camera(), "u": int(rng.integers(150, 400)), "v": int(rng.integers(120, 300))}
     wrong = float(rng.choice((-1.0, 1.0)) * rng.uniform(0.03, 0.10))
     fault = FaultPlan("depth_patch", {**parameters, "metres": wrong}, until_attempt=2)
     return replace(task, fault=fault, codes=(Code.OK, *_ASTRAY, *_NO_WAY, Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT,
@@ -99,15 +102,18 @@ def _too_wide(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _far(task: Task, rng: np.random.Generator) -> Task:
-    x, y = round(float(rng.uniform(0.51, 0.53)), 3), round(float(rng.choice((-1, 1)) * rng.uniform(0.37, 0.40)), 3)
+    """Beyond the reach of the arms in x, near the end of their region to a side."""
+    xs, ys = past(robot_work().region.x, 0.15, 0.17), past(robot_work().region.abs_y, -0.05, -0.02)
+    x, y = round(float(rng.uniform(*xs)), 3), round(float(rng.choice((-1, 1)) * rng.uniform(*ys)), 3)
     far = _target(task).model_copy(update={"shape": "box", "size": (0.05, 0.05, 0.05), "position": (x, y)})
     return replace(task, scene=_objects(task, far), codes=_NO_WAY)
 
 
 def _walled(task: Task, rng: np.random.Generator) -> Task:
     """Surround the object closely by boxes that are a little higher."""
-    side = float(rng.choice((-1.0, 1.0)))
-    x, y = float(rng.uniform(0.22, 0.30)), side * float(rng.uniform(0.18, 0.30))
+    region, side = robot_work().region, float(rng.choice((-1.0, 1.0)))
+    x = float(rng.uniform(*within(region.x, 0.06, 0.06)))
+    y = side * float(rng.uniform(*within(region.abs_y, 0.12, 0.12)))
     low = _target(task).model_copy(update={"shape": "box", "size": (0.05, 0.05, 0.05), "position": (x, y), "yaw": 0.0})
     colors = [color for color in ("red", "orange", "yellow", "green", "blue", "purple") if color != low.color]
     walls: list[SceneObject] = []
@@ -123,8 +129,9 @@ def _walled(task: Task, rng: np.random.Generator) -> Task:
 
 def _corridor(task: Task, rng: np.random.Generator) -> Task:
     """Put a tall screen between the object and the side of the arm."""
-    side = float(rng.choice((-1.0, 1.0)))
-    x, y = float(rng.uniform(0.20, 0.28)), side * float(rng.uniform(0.15, 0.25))
+    region, side = robot_work().region, float(rng.choice((-1.0, 1.0)))
+    x = float(rng.uniform(*within(region.x, 0.04, 0.08)))
+    y = side * float(rng.uniform(*within(region.abs_y, 0.09, 0.17)))
     item = _target(task).model_copy(update={"position": (x, y)})
     color = "green" if item.color != "green" else "purple"
     size, place = (0.16, 0.03, round(float(rng.uniform(0.16, 0.24)), 3)), (x, y + side * 0.13)
@@ -139,7 +146,7 @@ def _heavy(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _place_off_table(task: Task, rng: np.random.Generator) -> Task:
-    return replace(task, place=(0.95, 0.0), codes=(Code.INVALID_ARGUMENT,))
+    return replace(task, place=(round(task.scene.table.x[1] + 0.14, 3), 0.0), codes=(Code.INVALID_ARGUMENT,))
 
 
 def _place_taken(task: Task, rng: np.random.Generator) -> Task:
@@ -147,7 +154,8 @@ def _place_taken(task: Task, rng: np.random.Generator) -> Task:
     x, y = item.position[0], item.position[1]
     color = "green" if item.color != "green" else "purple"
     side = 1.0 if y >= 0 else -1.0
-    other = (x, y + side * 0.12) if abs(y) < 0.28 else (x, y - side * 0.12)
+    outer = within(robot_work().region.abs_y, 0.0, 0.14)[1]
+    other = (x, y + side * 0.12) if abs(y) < outer else (x, y - side * 0.12)
     block = SceneObject(name="block", shape="box", size=(0.05, 0.05, 0.06), color=color, position=other)
     return replace(task, scene=_objects(task, item, block), place=other, codes=(Code.IN_COLLISION,))
 
@@ -162,12 +170,11 @@ def _two_alike(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _arm_in_the_way(task: Task, rng: np.random.Generator) -> Task:
-    """Hold both arms over the table, between the camera and the objects, when the request arrives."""
-    right = (0.14, 2.46, -1.17, 1.79, -0.3, -0.4, 0.71)
+    """Hold the arms over the table, between the camera and the objects, when the request arrives."""
     posture: dict[str, float] = {}
     robot = RobotDescription.load()
-    for arm, q in zip(reversed(robot.arm_names), (right, robot.mirrored(right).tolist()), strict=True):
-        posture |= dict(zip(robot.arm_joints(arm), q, strict=True))
+    for arm in robot.arm_names:
+        posture |= robot.group_state(f"{arm}_arm", "over_table")
     return replace(task, posture=posture)
 
 
@@ -176,9 +183,9 @@ KINDS: Mapping[str, Maker] = MappingProxyType(
     {
         # what must be recovered from
         "detection_missed": _missed,
-        "frames_dropped": _fault("camera_drop", camera="overhead", share=(0.4, 0.7)),
-        "frames_late": _fault("camera_delay", camera="overhead", seconds=(0.1, 0.25)),
-        "stamps_off": _fault("stamp_offset", camera="overhead", ms=(20.0, 100.0)),
+        "frames_dropped": _fault("camera_drop", camera=table_camera, share=(0.4, 0.7)),
+        "frames_late": _fault("camera_delay", camera=table_camera, seconds=(0.1, 0.25)),
+        "stamps_off": _fault("stamp_offset", camera=table_camera, ms=(20.0, 100.0)),
         "light_changed": _fault("light_changed", scale=(0.5, 1.4)),
         "nudged_before_the_approach": _nudged("MOVE_TO_PREGRASP"),
         "nudged_before_the_grasp": _nudged("MOVE_TO_GRASP"),
@@ -192,11 +199,11 @@ KINDS: Mapping[str, Maker] = MappingProxyType(
         "corridor_blocked": _corridor,
         # what must be refused; here, since the order gives each seed its kind
         "intrinsics_off": _fault(
-            "intrinsics_bias", Code.INTRINSICS_MISMATCH, camera="overhead", focal=(0.05, 1.0), cx=(-60.0, 60.0)
+            "intrinsics_bias", Code.INTRINSICS_MISMATCH, camera=table_camera, focal=(0.05, 1.0), cx=(-60.0, 60.0)
         ),
         # what may be recovered from, and must be reported truly when not
         "mount_knocked": _fault(
-            "mount_knocked", Code.OK, *_ASTRAY, *_NO_WAY, *_NOT_AS_CALIBRATED, camera="overhead", mm=10.0, deg=1.0
+            "mount_knocked", Code.OK, *_ASTRAY, *_NO_WAY, *_NOT_AS_CALIBRATED, camera=table_camera, mm=10.0, deg=1.0
         ),
         "depth_patch": _depth_patch,
         "joints_late": _fault("joint_late", Code.OK, Code.EXECUTION_FAILED, ms=(50.0, 150.0)),
@@ -209,7 +216,7 @@ KINDS: Mapping[str, Maker] = MappingProxyType(
         "walled_in": _walled,
         "too_heavy": _heavy,
         "icy": _fault("friction_lowered", *_NOTHING_HELD, Code.HAND_COLLISION, scale=0.02),
-        "camera_dead": _fault("camera_drop", Code.STALE_DATA, camera="overhead", share=1.0),
+        "camera_dead": _fault("camera_drop", Code.STALE_DATA, camera=table_camera, share=1.0),
         "joint_states_silent": _fault("joint_state_gap", Code.ROBOT_LOST, when="PLAN", ms=9000.0, every=9.0),
         "gripper_stuck": _fault("gripper_stuck", Code.EXECUTION_FAILED, side="both"),
         "place_off_table": _place_off_table,

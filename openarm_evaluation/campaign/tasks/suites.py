@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 from openarm_evaluation.campaign.tasks.faults import fault_task
 from openarm_evaluation.campaign.tasks.task import Task, clutter, endurance, nominal
 from openarm_evaluation.campaign.tasks.two_arms import handover_task, in_turn_task, pair_task, push_task
@@ -19,14 +20,21 @@ SUITES = {
     "pairs": pair_task,
     "pairs_in_turn": in_turn_task,
 }
+#: Those that two arms share.
+OF_TWO_ARMS = ("handover", "pairs", "pairs_in_turn")
 
 
 def make_task(set_name: str, seed: int) -> Task:
-    """Make the task of a suite and a seed.
+    """Make the task of a suite and a seed, for this process's robot.
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, listing the suites.
+        OpenArmError: INVALID_ARGUMENT, listing the suites; a suite of two arms, for a robot with one.
     """
     if set_name not in SUITES:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"no suite {set_name!r}; suites: {', '.join(SUITES)}")
+    robot = RobotDescription.load()
+    if set_name in OF_TWO_ARMS and len(robot.arm_names) < 2:
+        mine = ", ".join(name for name in SUITES if name not in OF_TWO_ARMS)
+        text = f"suite {set_name!r} needs two arms, robot {robot.name!r} has {len(robot.arm_names)}; suites: {mine}"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
     return SUITES[set_name](seed)

@@ -45,7 +45,7 @@ class Task:
         seed: Of everything that is drawn.
         scene: What is on the table.
         labels: Requested objects, one after the other.
-        arm: auto, left or right.
+        arm: auto, or an arm of the robot.
         kind: What is special, for the report.
         fault: What goes wrong; None: nothing.
         sets: Parameters of nodes, `node.param=value`: faults that nodes inject themselves.
@@ -75,6 +75,16 @@ class Task:
     clear: bool = False
     route: str = ""
     together: bool = False
+
+
+def within(ends: tuple[float, float], low: float, high: float) -> tuple[float, float]:
+    """Return an interval less so much at its ends, m, to the millimetre; negative: beyond them."""
+    return round(ends[0] + low, 3), round(ends[1] - high, 3)
+
+
+def past(ends: tuple[float, float], near: float, far: float) -> tuple[float, float]:
+    """Return the interval that begins and ends so much after the end of another one, m, to the millimetre."""
+    return round(ends[1] + near, 3), round(ends[1] + far, 3)
 
 
 def nominal(seed: int) -> Task:

@@ -15,35 +15,39 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import robot_work
 from openarm_common.scene.scene import PALETTE, Scene, SceneObject, parse_scene, random_scene
 from openarm_evaluation.campaign.in_process_robot import approach_of
 from openarm_evaluation.campaign.robot import arms_behind
-from openarm_evaluation.campaign.tasks.task import Task
+from openarm_evaluation.campaign.tasks.task import Task, past, within
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import propose, target_box
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.interface import PlanGrasp
 from openarm_motion.planning.approach import plan_approach
 
-#: Least distance of an object of a hand-over, and of its place, from the middle, m: the other arm reaches over to 0.21.
-_ASIDE = 0.26
+#: Least distance of an object of a hand-over, and of its place, from the near end of the region, m: the other arm
+#: reaches over the middle, less far.
+_ASIDE = 0.20
+#: And of the objects around.
+_BESIDE = 0.10
 #: Between the middles of a place and any object, m.
 _APART = 0.13
-#: Region of objects that no arm can grasp but a hand can push: in front of the robot, between the arms.
-_BAND_X, _BAND_ABS_Y = (0.37, 0.43), 0.03
 
 
 def handover_task(seed: int) -> Task:
     """Request an object on one arm's side to be placed on the other's; up to two others around, not in the middle."""
-    rng = np.random.default_rng([seed, 4])
+    rng, region = np.random.default_rng([seed, 4]), robot_work().region
+    aside, beside = (round(region.abs_y[0] + distance, 3) for distance in (_ASIDE, _BESIDE))
+    xs, ys = within(region.x, 0.02, 0.02), (aside, within(region.abs_y, 0.0, 0.02)[1])
     while True:
         scene = random_scene(int(rng.integers(1 << 31)), count=int(rng.integers(1, 4)))
         first = scene.objects[0]
         others = [np.array(item.position[:2]) for item in scene.objects[1:]]
-        if abs(first.position[1]) < _ASIDE or any(abs(p[1]) < 0.16 for p in others):
+        if abs(first.position[1]) < aside or any(abs(p[1]) < beside for p in others):
             continue
         side = -np.sign(first.position[1])
-        place = np.array([rng.uniform(0.18, 0.34), side * rng.uniform(_ASIDE, 0.40)]).round(3)
+        place = np.array([rng.uniform(*xs), side * rng.uniform(*ys)]).round(3)
         if all(np.linalg.norm(place - p) >= _APART for p in others):
             break
     named = scene.model_copy(update={"name": f"handover_{seed}"})
@@ -79,6 +83,9 @@ def push_task(seed: int) -> Task:
 
 
 def _one_object(seed: int, rng: np.random.Generator) -> Scene:
+    """Draw an object that no arm can grasp but a hand can push: past the region, between the arms."""
+    region = robot_work().region
+    xs, half = past(region.x, 0.01, 0.07), region.abs_y[0] / 2.0
     color = str(rng.choice(list(PALETTE)))
     a, b, c = (round(float(edge), 3) for edge in rng.uniform((0.04, 0.04, 0.04), (0.07, 0.07, 0.06)))
     item = SceneObject(
@@ -86,7 +93,7 @@ def _one_object(seed: int, rng: np.random.Generator) -> Scene:
         shape="box",
         size=(a, b, c),
         color=color,
-        position=(round(float(rng.uniform(*_BAND_X)), 3), round(float(rng.uniform(-_BAND_ABS_Y, _BAND_ABS_Y)), 3)),
+        position=(round(float(rng.uniform(*xs)), 3), round(float(rng.uniform(-half, half)), 3)),
         yaw=round(float(rng.uniform(-np.pi, np.pi)), 3),
         mass=round(float(rng.uniform(0.06, 0.25)), 3),
     )
@@ -99,7 +106,8 @@ def _graspable(scene: Scene, arm: str) -> bool:
     T = se3.make(se3.rot_z(item.yaw), item.centre(table))
     target = Detection(item.label, 1.0, T, np.array(item.size))
     solver = arms_behind((), table)[arm]
-    request = approach_of(PlanGrasp(arm, propose(target, config), (), target_box(target, config)))
+    grasps = propose(target, config, RobotDescription.load().hand(arm).parts)
+    request = approach_of(PlanGrasp(arm, grasps, (), target_box(target, config)))
     try:
         plan_approach(solver, solver.start_state(_home()), request)
     except OpenArmError as error:

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Meshes of a URDF: where their files are, and the convex hulls that stand for those of its collision shapes. m."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.resources import is_file
+from openarm_common.robot.urdf import Primitive, origin
+from openarm_common.robot.xml_text import floats
+from openarm_common.types import Array
+
+_PACKAGE, _FILE = "package://", "file://"
+#: How far corners of a convex mesh may be outside the plane of a triangle, and how low a triangle may be that says
+#: nothing about its plane: shares of the mesh's diagonal.
+_FLAT, _SLIVER = 1e-4, 1e-3
+
+
+def mesh_file(name: str, urdf: Path, packages: Mapping[str, Path] | None = None) -> Path:
+    """Find the file of a mesh.
+
+    The folder of `package://NAME/` is that of `packages`, or else `NAME` in `share` of the Python environment or of a
+    prefix in AMENT_PREFIX_PATH, or in the tree of the Python package NAME.
+
+    Args:
+        name: As the URDF says it: a path, absolute or from the folder of the URDF, `file://PATH`, or
+            `package://NAME/PATH`.
+        urdf: File of the description.
+        packages: Folders of packages by name.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming what was tried.
+    """
+    if not name.startswith(_PACKAGE):
+        path = urdf.parent / name.removeprefix(_FILE)
+        if not is_file(path):
+            raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: there is no mesh {path}")
+        return path
+    package, _, rest = name.removeprefix(_PACKAGE).partition("/")
+    tried = [folder / rest for folder in _folders(package, packages or {})]
+    for path in tried:
+        if is_file(path):
+            return path
+    places = ", ".join(map(str, dict.fromkeys(tried)))
+    raise OpenArmError(
+        Code.CONFIG_INVALID,
+        f"{urdf}: there is no mesh {name!r}; tried {places}; install package {package!r}, or name its prefix in"
+        " AMENT_PREFIX_PATH",
+    )
+
+
+def take_meshes(
+    robot: ET.Element, urdf: Path, packages: Mapping[str, Path] | None = None
+) -> dict[str, tuple[Primitive, ...]]:
+    """Read the collision meshes of a robot; names of files become absolute in the document.
+
+    A mesh that is convex is taken as it is, another becomes few convex hulls. No point of a mesh is outside its hulls;
+    how far these reach beyond it is up to its hollows. Visual meshes are not read, and may be missing.
+
+    Args:
+        robot: The <robot> document, changed.
+        urdf: The file it is from.
+        packages: See `mesh_file`.
+
+    Returns:
+        By link.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming the file that is missing or a mesh that can't be read.
+    """
+    for mesh in robot.findall("link/visual/geometry/mesh"):
+        try:
+            mesh.set("filename", _absolute(mesh_file(mesh.get("filename", ""), urdf, packages)))
+        except OpenArmError:
+            continue  # nothing that the suite does needs it; `openarm model check` says so
+    hulls: dict[str, tuple[Primitive, ...]] = {}
+    for link in robot.findall("link"):
+        name, found = link.get("name", ""), list[Primitive]()
+        for shape in link.findall("collision"):
+            mesh = shape.find("geometry/mesh")
+            if mesh is not None:
+                path = mesh_file(mesh.get("filename", ""), urdf, packages)
+                mesh.set("filename", _absolute(path))
+                scale = np.array(floats(mesh.get("scale", "1 1 1"), 3, mesh))
+                try:
+                    found += _hulls(path, scale, shape.get("name") or f"{name}_{path.stem}", origin(shape))
+                except OpenArmError as error:
+                    raise OpenArmError(error.code, f"{urdf}: link {name!r}: {error.message}") from error
+        if found:
+            hulls[name] = tuple(found)
+    return hulls
+
+
+def _hulls(path: Path, scale: Array, name: str, T: Array) -> list[Primitive]:
+    """Shapes in place of a mesh with a pose (4, 4) on its link."""
+    vertices, triangles = read_mesh(path, scale)
+    if is_convex(vertices, triangles):
+        parts = [np.unique(vertices[np.unique(triangles)], axis=0)]
+    else:
+        from openarm_common.robot.convex import convex_parts  # takes longer to import than convex meshes to read
+
+        parts = convex_parts(vertices, triangles)
+    out: list[Primitive] = []
+    for k, corners in enumerate(parts):
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        place = T.copy()
+        place[:3, 3] += T[:3, :3] @ (0.5 * (low + high))
+        x, y, z = (float(edge) for edge in high - low)
+        part = name if len(parts) == 1 else f"{name}_{k}"
+        out.append(Primitive(part, "box", (x, y, z), place, corners=corners - 0.5 * (low + high)))
+    return out
+
+
+def read_mesh(path: Path, scale: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Read a mesh; returns vertices (n, 3), m, and triangles (m, 3).
+
+    Args:
+        path: STL, OBJ, DAE or what else coal reads.
+        scale: (3,) factors of x, y, z; negative ones mirror.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, for what is no mesh.
+    """
+    import coal
+
+    if not scale.all():
+        raise OpenArmError(Code.CONFIG_INVALID, f"mesh {path} has scale {scale.tolist()}, expected no 0")
+    try:
+        loaded = coal.MeshLoader().load(str(path), scale)
+    except (RuntimeError, ValueError) as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"can't read mesh {path}: {said(error)}") from error
+    vertices = np.array(loaded.vertices(), dtype=np.float64).reshape(-1, 3)
+    triangles = np.array([[t[0], t[1], t[2]] for t in map(loaded.tri_indices, range(loaded.num_tris))], np.int64)
+    if not len(triangles) or not np.isfinite(vertices).all():
+        text = "has points that are not finite" if len(triangles) else "has no triangle"
+        raise OpenArmError(Code.CONFIG_INVALID, f"mesh {path} {text}")
+    return vertices, triangles
+
+
+def is_convex(vertices: Array, triangles: NDArray[np.int64]) -> bool:
+    """Whether no vertex (n, 3) is beyond the plane of a triangle (m, 3), be it turned outwards or inwards."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    normal = np.cross(b - a, c - a)
+    twice = np.linalg.norm(normal, axis=1)
+    longest = np.sqrt(np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0))
+    telling = twice > _SLIVER * size * longest
+    if not telling.any():
+        return False
+    unit = normal[telling] / twice[telling, None]
+    off = unit @ vertices.T - np.einsum("ij,ij->i", unit, a[telling])[:, None]
+    beyond = np.minimum(off.max(axis=1), -off.min(axis=1))
+    return bool((beyond <= _FLAT * size).all())
+
+
+def _absolute(path: Path) -> str:
+    return f"{_FILE}{path.resolve()}"
+
+
+def _folders(package: str, packages: Mapping[str, Path]) -> Iterator[Path]:
+    """Yield folders that `package://` may mean."""
+    if package in packages:
+        yield packages[package]
+    prefixes = [sys.prefix, *filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))]
+    yield from (Path(prefix) / "share" / package for prefix in prefixes)
+    spec = importlib.util.find_spec(package) if package.isidentifier() else None
+    for place in (spec.submodule_search_locations or ()) if spec is not None else ():
+        yield Path(place)
+        yield from (parent / "share" / package for parent in Path(place).parents)

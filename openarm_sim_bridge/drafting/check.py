@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Everything that is wrong with the folder of a robot, at once: `openarm model check`. m, rad."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+
+from openarm_common.errors import OpenArmError, said
+from openarm_common.robot.description import RobotDescription, part_faults
+from openarm_common.robot.folder import RobotFolder, read_folder
+from openarm_common.robot.meshes import mesh_file
+from openarm_sim_bridge.drafting.collisions import LinkContacts
+
+#: How far a posture may be outside of a limit, which has fewer digits in other files, rad.
+_ROUNDED = 1e-5
+
+
+def folder_faults(folder: Path) -> list[str]:
+    """Return what is wrong with the folder of a robot, a sentence each; nothing when all is well."""
+    try:
+        parts = read_folder(folder)
+        urdf = folder / (parts.xacro or parts.urdf)
+        robot = RobotDescription.from_files(urdf, folder / parts.srdf).of_folder(folder.name, parts)
+    except OpenArmError as error:
+        return [error.message]
+    faults = part_faults(parts, robot)
+    if faults:  # what follows looks these parts up
+        return [*faults, *_mesh_faults(robot, urdf), *_limit_faults(robot)]
+    faults = [*_mesh_faults(robot, urdf), *_limit_faults(robot), *_pad_faults(parts, robot), *_group_faults(robot)]
+    try:
+        contacts = LinkContacts(robot)
+    except ValueError as error:
+        return [*faults, f"pinocchio does not read the URDF: {said(error)}", *_mujoco_faults(robot, urdf)]
+    always = sorted(map(sorted, contacts.always_touching() - robot.allowed_collisions))
+    return [
+        *faults,
+        *_posture_faults(robot, contacts),
+        *(f"{' and '.join(pair)} touch in every random state, and the SRDF does not allow it" for pair in always),
+        *_mujoco_faults(robot, urdf),
+    ]
+
+
+def _mesh_faults(robot: RobotDescription, urdf: Path) -> Iterator[str]:
+    for mesh in ET.fromstring(robot.urdf).findall("link/*/geometry/mesh"):
+        try:
+            mesh_file(mesh.get("filename", ""), urdf)
+        except OpenArmError as error:
+            yield error.message
+
+
+def _limit_faults(robot: RobotDescription) -> Iterator[str]:
+    for joint in robot.joints.values():
+        if joint.type == "fixed" or joint.mimic is not None:
+            continue
+        for what, value in (("velocity", joint.velocity), ("effort", joint.effort)):
+            if not math.isfinite(value) or value <= 0.0:
+                given = "no limit" if math.isinf(value) else f"the limit {value:g}"
+                yield f"joint {joint.name!r} has {given} of {what}, expected one > 0"
+
+
+def _pad_faults(parts: RobotFolder, robot: RobotDescription) -> Iterator[str]:
+    shapes = {shape.name for link in robot.links.values() for shape in link.collision}
+    for name, arm in parts.arms.items():
+        for finger in arm.fingers:
+            if f"{finger}_pad_collision" not in shapes:
+                yield f"arms.{name}: finger {finger!r} has no collision shape {finger}_pad_collision"
+
+
+def _group_faults(robot: RobotDescription) -> Iterator[str]:
+    wanted = [f"{arm}_gripper" for arm in robot.arms] + (["both_arms"] if len(robot.arms) == 2 else [])
+    yield from (f"the SRDF has no group {group}" for group in wanted if group not in robot.semantics.groups)
+    there = set(robot.semantics.states)
+    homes = [(f"{arm}_arm", "home") for arm in robot.arms]
+    yield from (
+        f"the SRDF has no posture {state!r} of {group}" for group, state in homes if (group, state) not in there
+    )
+
+
+def _posture_faults(robot: RobotDescription, contacts: LinkContacts) -> Iterator[str]:
+    others = robot.semantics.states.get(("both_arms", "home"), {})
+    for (group, name), state in robot.semantics.states.items():
+        for joint, value in state.items():
+            lower, upper = robot.joint(joint).lower, robot.joint(joint).upper
+            if not lower - _ROUNDED <= value <= upper + _ROUNDED:
+                yield f"posture {name!r} of {group}: {joint} at {value:g}, expected {lower:g} .. {upper:g}"
+        for pair in sorted(map(sorted, contacts.at({**others, **state}) - robot.allowed_collisions)):
+            yield f"posture {name!r} of {group}: {' and '.join(pair)} touch"
+
+
+def _mujoco_faults(robot: RobotDescription, urdf: Path) -> Iterator[str]:
+    root = ET.fromstring(robot.urdf)
+    try:
+        files = {mesh_file(mesh.get("filename", ""), urdf) for mesh in root.findall("link/*/geometry/mesh")}
+    except OpenArmError:
+        return  # said already
+    for a, b in itertools.combinations(sorted(files), 2):
+        if a.name == b.name:
+            yield f"MuJoCo takes meshes {a} and {b} for one, by their names"
+    ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", fusestatic="false", discardvisual="false")
+    try:
+        text = ET.tostring(root, encoding="unicode")
+        mujoco.MjSpec.from_string(text, assets={path.name: path.read_bytes() for path in files}).compile()
+    except ValueError as error:
+        yield f"MuJoCo does not read the URDF: {error}"

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which links of a robot touch: in random states, in all of them, and in given ones. m, rad."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import ConvexHull
+
+from openarm_common.robot.description import Joint, Primitive, RobotDescription
+from openarm_common.types import Array
+
+Pair = frozenset[str]
+#: States in which links must touch that always do.
+_ALWAYS = 1000
+
+
+class LinkContacts:
+    """The collision shapes of a robot, with all pairs of links that can move to each other.
+
+    Args:
+        description: The robot; collision meshes are hulls, see `RobotDescription.from_files`.
+        margin: Links that are nearer to each other touch, m.
+    """
+
+    def __init__(self, description: RobotDescription, margin: float = 0.0) -> None:
+        self._model = pin.buildModelFromXML(description.urdf)
+        self._geometry, owner = pin.GeometryModel(), list[str]()
+        for link in description.links.values():
+            frame = self._model.frames[self._model.getFrameId(link.name, pin.FrameType.BODY)]
+            for shape in link.collision:
+                placement = frame.placement * pin.SE3(shape.T_link_primitive)
+                name = f"{shape.name} {len(owner)}"
+                item = pin.GeometryObject(name, frame.parentJoint, placement, coal_shape(shape))
+                self._geometry.addGeometryObject(item)
+                owner.append(link.name)
+        self._geometry.addAllCollisionPairs()
+        self._pairs = [frozenset((owner[p.first], owner[p.second])) for p in self._geometry.collisionPairs]
+        self._data, self._placed = self._model.createData(), self._geometry.createData()
+        for request in self._placed.collisionRequests:
+            request.security_margin = margin
+        joints = {joint.name: self._model.joints[self._model.getJointId(joint.name)] for joint in _moving(description)}
+        self._columns = {name: joint.idx_q for name, joint in joints.items()}
+        self._endless = {name for name, joint in joints.items() if joint.nq == 2}
+        self._followers = [joint for joint in _moving(description) if joint.mimic is not None]
+
+    def touching(self, samples: int, seed: int) -> set[Pair]:
+        """Return the pairs of links that touch in at least one random state."""
+        left = self._by_links()
+        found: set[Pair] = set()
+        rng = np.random.default_rng(seed)
+        for _ in range(samples):
+            for pair in self._hits(self._random(rng), left):
+                found.add(pair)
+                for k in left.pop(pair):
+                    self._placed.deactivateCollisionPair(k)
+        self._activate()
+        return found
+
+    def always_touching(self, samples: int = _ALWAYS, seed: int = 0) -> set[Pair]:
+        """Return the pairs of links that touch in every random state."""
+        left = self._by_links()
+        rng = np.random.default_rng(seed)
+        for _ in range(samples):
+            hits = self._hits(self._random(rng), left)
+            for pair in set(left) - hits:
+                for k in left.pop(pair):
+                    self._placed.deactivateCollisionPair(k)
+            if not left:
+                break
+        self._activate()
+        return set(left)
+
+    def at(self, state: Mapping[str, float]) -> set[Pair]:
+        """Return the pairs of links that touch in a state; joints that it does not name are at 0, followers follow."""
+        q: Array = np.array(pin.neutral(self._model))
+        for name, value in state.items():
+            self._put(q, name, value)
+        return self._hits(self._followed(q), self._by_links())
+
+    def _activate(self) -> None:
+        for k in range(len(self._pairs)):
+            self._placed.activateCollisionPair(k)
+
+    def _by_links(self) -> dict[Pair, list[int]]:
+        found: dict[Pair, list[int]] = {}
+        for k, pair in enumerate(self._pairs):
+            found.setdefault(pair, []).append(k)
+        return found
+
+    def _random(self, rng: np.random.Generator) -> Array:
+        q = rng.uniform(self._model.lowerPositionLimit, self._model.upperPositionLimit)
+        for name in self._endless:
+            self._put(q, name, np.pi * q[self._columns[name]])
+        return self._followed(q)
+
+    def _put(self, q: Array, name: str, value: float) -> None:
+        k = self._columns[name]
+        if name in self._endless:  # pinocchio keeps a continuous joint as cosine and sine
+            q[k : k + 2] = np.cos(value), np.sin(value)
+        else:
+            q[k] = value
+
+    def _followed(self, q: Array) -> Array:
+        for joint in self._followers:
+            q[self._columns[joint.name]] = joint.multiplier * q[self._columns[str(joint.mimic)]] + joint.offset
+        return q
+
+    def _hits(self, q: Array, among: Mapping[Pair, list[int]]) -> set[Pair]:
+        if not pin.computeCollisions(self._model, self._data, self._geometry, self._placed, q, False):
+            return set()
+        results = self._placed.collisionResults
+        return {pair for pair, ks in among.items() if any(results[k].isCollision() for k in ks)}
+
+
+def coal_shape(shape: Primitive) -> coal.CollisionGeometry:
+    """Return a shape for coal, in its own frame."""
+    if shape.corners is not None:
+        points, triangles = hull_mesh(shape.corners)
+        corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+        corners.extend(list(points))
+        faces.extend([coal.Triangle(*triangle) for triangle in triangles.tolist()])
+        return coal.Convex(corners, faces)
+    if shape.kind == "box":
+        return coal.Box(*shape.size)
+    return coal.Cylinder(*shape.size) if shape.kind == "cylinder" else coal.Sphere(*shape.size)
+
+
+def hull_mesh(points: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Return the vertices (n, 3) of the convex hull of points, and its triangles (m, 3) turned outwards."""
+    hull = ConvexHull(points)
+    index = np.full(len(points), -1, np.int64)
+    index[hull.vertices] = np.arange(len(hull.vertices))
+    a, b, c = (points[hull.simplices[:, k]] for k in range(3))
+    inwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
+    triangles = index[hull.simplices]
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    return points[hull.vertices], triangles
+
+
+def adjacent_pairs(description: RobotDescription) -> set[Pair]:
+    """Links with shapes that a joint connects, directly or over links without shapes."""
+    pairs: set[Pair] = set()
+    for name, link in description.links.items():
+        if link.collision:
+            parents = [j.parent for j in description.chain(name) if description.links[j.parent].collision]
+            if parents:
+                pairs.add(frozenset((parents[-1], name)))
+    return pairs
+
+
+def mirror_links(description: RobotDescription) -> dict[str, str]:
+    """Return the link of the mirror image of each link.
+
+    Of two arms that are mirror images (y negated in the base frame) they are assigned to each other by their places in
+    the zero posture; of several at one place it is the one of the same rank. Other links are their own image.
+    """
+    same = {name: name for name in description.links}
+    if len(description.arms) != 2 or not description.mirror:
+        return same
+    zero = dict.fromkeys(description.joints, 0.0)
+    T_base_root = np.linalg.inv(description.link_pose(description.base, zero))
+    places = {name: (T_base_root @ T)[:3, 3] for name, T in description.link_poses(zero).items()}
+    arms = [description.links_of(arm) for arm in description.arm_names]
+    first, second = (np.array([places[link] for link in links]) for links in arms)
+    away = np.linalg.norm((first * (1.0, -1.0, 1.0))[:, None] - second, axis=2)
+    away += 1e-6 * np.abs(np.subtract.outer(np.arange(len(first)), np.arange(len(second))))
+    for i, k in zip(*linear_sum_assignment(away), strict=True):
+        same[arms[0][i]], same[arms[1][k]] = arms[1][k], arms[0][i]
+    return same
+
+
+def _moving(description: RobotDescription) -> list[Joint]:
+    return [joint for joint in description.joints.values() if joint.type != "fixed"]
