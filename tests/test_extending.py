@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from openarm_bringup.supervision.graph import load_graph
 from openarm_common.camera.cameras import load_cameras
@@ -17,6 +18,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_grasp.strategies import registry
 from openarm_motion.planning.planner import PlanQuery, make_planner
+from openarm_sim_bridge.drafting.edits import Edits, matching
+from openarm_sim_bridge.drafting.semantics import SemanticsSource
 from tests.openarm_grasp.scripted import Wait, World, standing
 
 ROOT = Path(__file__).parents[1]
@@ -46,6 +49,14 @@ def test_each_recipe_touches_at_most_three_files_that_there_are() -> None:
         assert len(files) <= 3
         for path, new in files:
             assert (ROOT / path).exists() == (not new), path
+
+
+def test_the_edits_and_semantics_of_the_robot_are_valid() -> None:
+    edits = Edits.model_validate(yaml.safe_load(example("A robot", "yaml")))
+    assert [matching(edits.velocity, name, 0.0) for name in ("left_joint4", "left_joint5")] == [5.4, 20.9]
+    source = SemanticsSource.model_validate(yaml.safe_load(example("A robot", "yaml", 1)))
+    assert len(source.checked(["left", "right"])) == 3
+    assert source.allowed(["left"]) == {frozenset(("left_finger", "left_thumb"))}
 
 
 def test_the_camera_is_read_and_its_graph_is_valid(tmp_path: Path) -> None:

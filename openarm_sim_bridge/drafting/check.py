@@ -11,6 +11,7 @@ from pathlib import Path
 
 import mujoco
 
+from openarm_common.config import read_text
 from openarm_common.errors import OpenArmError, said
 from openarm_common.robot.description import RobotDescription, part_faults
 from openarm_common.robot.folder import RobotFolder, read_folder
@@ -25,10 +26,13 @@ def folder_faults(folder: Path) -> list[str]:
     """Return what is wrong with the folder of a robot, a sentence each; nothing when all is well."""
     try:
         parts = read_folder(folder)
-        urdf = folder / (parts.xacro or parts.urdf)
-        robot = RobotDescription.from_files(urdf, folder / parts.srdf).of_folder(folder.name, parts)
     except OpenArmError as error:
         return [error.message]
+    urdf = folder / (parts.xacro or parts.urdf)
+    try:
+        robot = RobotDescription.from_files(urdf, folder / parts.srdf).of_folder(folder.name, parts)
+    except OpenArmError as error:
+        return list(dict.fromkeys([error.message, *_faults_of_text(urdf)]))
     faults = part_faults(parts, robot)
     if faults:  # what follows looks these parts up
         return [*faults, *_mesh_faults(robot, urdf), *_limit_faults(robot)]
@@ -44,6 +48,15 @@ def folder_faults(folder: Path) -> list[str]:
         *(f"{' and '.join(pair)} touch in every random state, and the SRDF does not allow it" for pair in always),
         *_mujoco_faults(robot, urdf),
     ]
+
+
+def _faults_of_text(urdf: Path) -> list[str]:
+    """What is wrong with a URDF besides the fault that keeps it from being read with its files."""
+    try:
+        robot = RobotDescription.from_urdf(read_text(urdf))
+    except OpenArmError:
+        return []
+    return [*_mesh_faults(robot, urdf), *_limit_faults(robot)]
 
 
 def _mesh_faults(robot: RobotDescription, urdf: Path) -> Iterator[str]:

@@ -15,8 +15,8 @@ from openarm_common.robot.description import RobotDescription
 
 MJCF = """<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1"/>
   <body name="a" pos="0 0 0.2"><joint name="j" range="0 1"/><geom type="box" size="0.02 0.02 0.02" mass="1"/>
-  <body name="b" pos="0 0 0.1"><joint name="g" range="0 1" axis="1 0 0"/><geom type="sphere" size="0.01" mass="1"/>
-  </body></body></worldbody></mujoco>"""
+    <body name="b" pos="0 0 0.1"><joint name="g" range="0 1" axis="1 0 0"/><geom type="sphere" size="0.01" mass="1"/>
+    </body></body></worldbody></mujoco>"""
 
 
 @pytest.fixture

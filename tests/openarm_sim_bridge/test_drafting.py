@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import models_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import load_folder, robot_names
 from openarm_common.robot.meshes import mesh_file, read_mesh
@@ -119,13 +120,6 @@ def test_a_urdf_moves_as_the_mjcf_that_it_is_from(mjcf):
     assert_same_motion(model, UrdfDraft("two", model, Edits.model_validate(EDITS)).text())
 
 
-@pytest.mark.requirement("R-04")
-def test_openarm_v2_moves_as_its_maker_s_model():
-    """All bodies of both arms, and the torques of a motion."""
-    maker = mesh_file("package://openarm_mujoco/v2/pedestal/openarm_pedestal.xml", Path())
-    assert_same_motion(compiled(maker), RobotDescription.load("openarm_v2").urdf)
-
-
 def test_joints_have_limits_efforts_damping_and_the_actuated_finger_leads(folder):
     robot = RobotDescription.from_files(folder / "two.urdf")
     joint = robot.joints["left_hinge"]
@@ -219,6 +213,16 @@ def test_a_check_says_all_faults_at_once(folder):
     assert len(faults) == before + 6
 
 
+def test_a_check_goes_on_without_the_files_that_are_missing(folder):
+    (folder / "meshes" / "collision" / "part_hull.stl").unlink()
+    (folder / "meshes" / "visual" / "part.stl").unlink()
+    faults = folder_faults(folder)
+    assert sum("there is no mesh" in f for f in faults) == 2  # each file once
+    assert sum("limit 0 of effort" in f for f in faults) == 4
+    (folder / "two.srdf").unlink()
+    assert f"there is no file {folder / 'two.srdf'}" in folder_faults(folder)
+
+
 def test_a_check_names_links_that_touch_in_a_posture_or_always(folder):
     broken(folder, 'link1="right_f1" link2="right_f2"', 'link1="right_1" link2="right_f2"')
     broken(folder, '<origin xyz="-0.02 0 0.2"', '<origin xyz="0.02 0 0.2"', "two.urdf")
@@ -276,3 +280,25 @@ def test_triangles_are_shared_by_weight_and_never_more_than_allowed():
     assert found["c"] == 30
     assert 7900 < 2 * found["a"] + found["b"] + found["c"] <= 8000
     assert _budgets(meshes, 50_000) == {"a": 10_000, "b": 10_000, "c": 30}
+
+
+V2 = models_dir() / "robots" / "openarm_v2"
+
+
+@pytest.fixture(scope="module")
+def maker() -> mujoco.MjModel:
+    """The maker's model of OpenArm v2."""
+    return compiled(mesh_file("package://openarm_mujoco/v2/pedestal/openarm_pedestal.xml", V2 / "openarm_v2.urdf"))
+
+
+@pytest.mark.requirement("B-07", "R-04")
+def test_openarm_v2_moves_as_its_maker_s_model(maker):
+    assert_same_motion(maker, RobotDescription.load("openarm_v2").urdf)
+
+
+def test_the_urdf_of_openarm_v2_is_drafted_from_its_maker_s_model(maker):
+    edits = Edits.model_validate(yaml.safe_load((V2 / "edits.yaml").read_text()))
+    head, rest = UrdfDraft("openarm_v2", maker, edits).text().split("\n", 1)
+    text = (V2 / "openarm_v2.urdf").read_text()
+    assert text.startswith(head)
+    assert text.endswith(rest)
