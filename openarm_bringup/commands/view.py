@@ -94,7 +94,7 @@ def make_server(host: str, on_end: Callable[[BaseException], None]) -> Iterator[
     from openarm_bringup.view.guard import Guard
     from openarm_bringup.view.ros.page import GraphView
     from openarm_bringup.view.server import ViewServer
-    from openarm_bringup.view.wire import robot_shapes
+    from openarm_bringup.view.wire import robot_meshes, robot_shapes
     from openarm_grasp.requests.states import State
 
     loop = asyncio.get_running_loop()
@@ -107,6 +107,6 @@ def make_server(host: str, on_end: Callable[[BaseException], None]) -> Iterator[
         "cameras": [camera.name for camera in graph.cameras],
         "states": [state.value for state in State],
     }
-    server = ViewServer(Guard(host), hello, graph)
+    server = ViewServer(Guard(host), hello, graph, robot_meshes(graph.description))
     with graph:
         yield server

@@ -107,13 +107,14 @@ class ViewServer:
     Args:
         guard: Authorises requests.
         hello: What a page gets first: the robot, the cameras, the states of a grasp.
+        meshes: And then, a frame: those of the robot.
         view: Observes the graph; its methods but `want` block, and are called in threads.
     """
 
-    def __init__(self, guard: Guard, hello: Mapping[str, Any], view: GraphView) -> None:
+    def __init__(self, guard: Guard, hello: Mapping[str, Any], view: GraphView, meshes: bytes = b"") -> None:
         self.guard = guard
         self._view = view
-        self._hello = json.dumps({"kind": "hello", **hello})
+        self._hello, self._meshes = json.dumps({"kind": "hello", **hello}), meshes
         self._pages: set[_Page] = set()
         self._kept: dict[str, Item] = {}
         self._picking: asyncio.Task[None] | None = None
@@ -204,6 +205,8 @@ class ViewServer:
 
     async def _send(self, page: _Page, socket: web.WebSocketResponse) -> None:
         await socket.send_str(self._hello)
+        if self._meshes:
+            await socket.send_bytes(self._meshes)
         self._wants(page, ())
         while True:
             await page.news.wait()

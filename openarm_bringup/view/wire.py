@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -19,8 +20,9 @@ from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.codec import Leaves
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.meshes import read_mesh
 from openarm_common.robot.urdf import Primitive
-from openarm_common.types import Bytes, Floats
+from openarm_common.types import Array, Bytes, Floats
 from openarm_perception.geometry.depth import Deprojector
 
 _KEY_ZERO = 1 << 15
@@ -40,16 +42,42 @@ def frame(head: Mapping[str, Any], *arrays: NDArray[Any] | bytes) -> bytes:
 def robot_shapes(description: RobotDescription) -> dict[str, Any]:
     """The robot as the page draws it: names of the links, and shapes with the index of their link.
 
-    Poses are `T_link_shape`, 16 numbers by columns; `size` is that of `openarm_common.robot.urdf.Primitive`.
+    Poses are `T_link_shape`, 16 numbers by columns; `size` is that of `openarm_common.robot.urdf.Primitive`. A mesh has
+    its scale for a size, and the index of its file in `robot_meshes`.
     """
-    links = list(description.links)
+    links, files = list(description.links), _mesh_files(description)
     shapes = [_shape(i, shape) for i, link in enumerate(description.links.values()) for shape in link.visual]
+    for i, link in enumerate(description.links.values()):
+        for mesh in link.meshes:
+            rest = {"size": mesh.scale, "pose": _columns(mesh.T_link_mesh), "color": mesh.rgba or _GREY}
+            shapes.append({"link": i, "kind": "mesh", "mesh": files.index(mesh.file), **rest})
     return {"links": links, "shapes": shapes}
 
 
+def robot_meshes(description: RobotDescription) -> bytes:
+    """Triangles of the robot's visual meshes, a frame: their number by file, and three corners (x, y, z) of each.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, for a file that can't be read.
+    """
+    soups: list[Floats] = []
+    for file in _mesh_files(description):
+        vertices, triangles = read_mesh(Path(file.removeprefix("file://")), np.ones(3))
+        soups.append(vertices[triangles].astype(np.float32))
+    return frame({"kind": "meshes", "counts": [len(soup) for soup in soups]}, *soups)
+
+
+def _mesh_files(description: RobotDescription) -> list[str]:
+    return list(dict.fromkeys(mesh.file for link in description.links.values() for mesh in link.meshes))
+
+
 def _shape(link: int, shape: Primitive) -> dict[str, Any]:
-    pose = np.round(shape.T_link_primitive.T.ravel(), 6).tolist()
+    pose = _columns(shape.T_link_primitive)
     return {"link": link, "kind": shape.kind, "size": shape.size, "pose": pose, "color": shape.rgba or _GREY}
+
+
+def _columns(T: Array) -> list[float]:
+    return np.round(T.T.ravel(), 6).tolist()
 
 
 def link_poses(description: RobotDescription, q: Mapping[str, float]) -> Floats:

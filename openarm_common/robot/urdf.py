@@ -42,7 +42,6 @@ class Primitive:
         size: box: full edges x, y, z; cylinder: radius, length; sphere: radius.
         corners: (n, 3) in the frame of the shape, None for most. The shape is their convex hull, and what `kind` and
             `size` say is the box about it: all that a reader needs who can do with a larger shape.
-        material: Name of the material of a visual, "" without one.
         rgba: Colour of a visual, None without one.
     """
 
@@ -50,9 +49,24 @@ class Primitive:
     kind: ShapeKind
     size: tuple[float, ...]
     T_link_primitive: Array
-    material: str = ""
     rgba: Rgba | None = None
     corners: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A visual mesh on a link.
+
+    Attributes:
+        file: As the URDF names it; absolute, `file://PATH`, in a robot that was read from files.
+        scale: Factors of x, y, z; negative ones mirror.
+        rgba: Colour, None without one.
+    """
+
+    file: str
+    scale: tuple[float, ...]
+    T_link_mesh: Array
+    rgba: Rgba | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +74,14 @@ class Link:
     """A link.
 
     Attributes:
-        meshes: Names of visual shapes that are meshes.
+        meshes: Visual shapes that are meshes.
         unread: Names of collision shapes that are meshes, of a description that was read without its files.
     """
 
     name: str
     collision: tuple[Primitive, ...]
     visual: tuple[Primitive, ...]
-    meshes: tuple[str, ...] = ()
+    meshes: tuple[Mesh, ...] = ()
     unread: tuple[str, ...] = ()
 
 
@@ -156,16 +170,28 @@ def _primitive(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Primit
         raise fault(f"<{element.tag} {element.attrib}>: <{shape.tag}> is none of {', '.join(_SIZES)}, mesh")
     kind = cast(ShapeKind, shape.tag)
     size = tuple(value for key, count in _SIZES[kind] for value in floats(attribute(shape, key), count, shape))
+    return Primitive(element.get("name", ""), kind, size, origin(element), _colour(element, colors))
+
+
+def _colour(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Rgba | None:
+    """Colour of a shape: its own, or that of the material that it names."""
     material = element.find("material")
-    name, rgba = ("", None) if material is None else (material.get("name", ""), _rgba(material))
-    return Primitive(element.get("name", ""), kind, size, origin(element), name, rgba or colors.get(name))
+    return None if material is None else _rgba(material) or colors.get(material.get("name", ""))
 
 
 def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
     shapes = {tag: [(shape, _primitive(shape, colors)) for shape in element.findall(tag)] for tag in _SHAPE_TAGS}
     visual, collision = (tuple(one for _, one in found if one is not None) for found in shapes.values())
-    meshes, unread = (tuple(s.get("name", s.tag) for s, one in found if one is None) for found in shapes.values())
+    meshes = tuple(_mesh(shape, colors) for shape, one in shapes["visual"] if one is None)
+    unread = tuple(shape.get("name", shape.tag) for shape, one in shapes["collision"] if one is None)
     return Link(attribute(element, "name"), collision, visual, meshes, unread)
+
+
+def _mesh(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Mesh:
+    mesh = element.find("geometry/mesh")
+    assert mesh is not None  # `_primitive` has looked
+    scale = floats(mesh.get("scale", "1 1 1"), 3, mesh)
+    return Mesh(mesh.get("filename", ""), tuple(scale), origin(element), _colour(element, colors))
 
 
 def _child(element: ET.Element, tag: str, key: str) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from openarm_common.errors import OpenArmError
 from openarm_common.octree.codec import decode, encode_states
 from openarm_common.octree.lattice import Lattice
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.meshes import read_mesh
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
 SIDES = RobotDescription.load().arm_names
@@ -46,6 +48,29 @@ def test_shapes_and_poses_put_every_shape_where_the_description_does() -> None:
         T = poses[sent["link"]].reshape(4, 4).T @ np.array(sent["pose"]).reshape(4, 4).T
         expected = description.link_pose(link.name, full) @ shape.T_link_primitive
         np.testing.assert_allclose(T, expected, atol=2e-6)
+
+
+@pytest.mark.requirement("R-04")
+def test_meshes_are_sent_once_a_file_and_drawn_where_the_description_has_them() -> None:
+    description = RobotDescription.load("openarm_v2")
+    shapes = json.loads(json.dumps(wire.robot_shapes(description)))
+    drawn = [shape for shape in shapes["shapes"] if shape["kind"] == "mesh"]
+    visuals = [(name, mesh) for name, link in description.links.items() for mesh in link.meshes]
+    assert len(drawn) == len(visuals) > 50
+    data = wire.robot_meshes(description)
+    length = int.from_bytes(data[:4], "little")
+    counts = json.loads(data[4 : 4 + length])["counts"]
+    assert len(counts) == len({mesh.file for _, mesh in visuals}) < len(drawn)
+    corners = np.frombuffer(data[4 + length :], np.float32).reshape(-1, 3, 3)
+    assert len(corners) == sum(counts) < 40_000
+    for sent, (name, mesh) in list(zip(drawn, visuals, strict=True))[::7]:
+        assert shapes["links"][sent["link"]] == name
+        first = sum(counts[: sent["mesh"]])
+        own, _ = read_mesh(Path(mesh.file.removeprefix("file://")), np.ones(3))
+        low, high = (f(corners[first : first + counts[sent["mesh"]]], axis=(0, 1)) for f in (np.min, np.max))
+        np.testing.assert_allclose([low, high], [own.min(axis=0), own.max(axis=0)], atol=1e-6)
+        np.testing.assert_allclose(np.array(sent["pose"]).reshape(4, 4).T, mesh.T_link_mesh, atol=1e-6)
+        assert tuple(sent["size"]) == mesh.scale
 
 
 def test_occupied_cells_cover_what_is_occupied_and_nothing_else() -> None:

@@ -50,6 +50,20 @@ export function solid(shape, pose, size, color, opacity) {
   return place(new THREE.Mesh(SHAPES[shape], shiny(color, opacity)), pose, size);
 }
 
+/** Triangles, nine numbers each. */
+export function facets(corners) {
+  const made = geometry({ position: [corners, 3] });
+  made.computeVertexNormals();
+  return made;
+}
+
+/** A mesh of `facets`; a scale that mirrors turns the triangles inside out, so both sides are drawn. */
+export function faceted(shape, pose, scale, color) {
+  const look = shiny(color);
+  look.side = THREE.DoubleSide;
+  return place(new THREE.Mesh(shape, look), pose, scale);
+}
+
 export function boxEdges(pose, size, color) {
   return place(new THREE.LineSegments(EDGES, new THREE.LineBasicMaterial({ color: new THREE.Color(...color) })), pose, size);
 }

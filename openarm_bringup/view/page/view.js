@@ -2,7 +2,7 @@
 // The page: data of the wanted layers come by a websocket, scene and panel show them, requests go to the server.
 
 import { AskPanel, GraspPanel, HealthPanel, StopPanel, element } from "./panel.js";
-import { Scene, boxEdges, cubes, group, lines, place, points, solid } from "./scene.js";
+import { Scene, boxEdges, cubes, faceted, facets, group, lines, place, points, solid } from "./scene.js";
 
 const $ = (id) => document.getElementById(id);
 const token = takeToken();
@@ -19,6 +19,7 @@ let socket = null;
 let links = new Map(); // of the robot, with what hangs on them
 let held = [];
 let boxes = [];
+let meshes = [];
 
 const handlers = {
   hello(message) {
@@ -27,6 +28,9 @@ const handlers = {
     if (!$("cameras").children.length) makeCameras(message.cameras);
     drawFloor();
     want();
+  },
+  meshes(head, body) {
+    showMeshes(head.counts, body);
   },
   robot(_, body) {
     [...links.values()].forEach((link, i) => place(link, new Float32Array(body, 64 * i, 16)).visible = true);
@@ -147,12 +151,26 @@ const GLASS = [0.31, 0.7, 0.75];
 function showRobot(robot) {
   links = new Map(robot.links.map((name) => [name, group()]));
   const all = [...links.values()];
-  for (const { link, kind, size, pose, color } of robot.shapes) {
+  meshes = robot.shapes.filter(({ kind }) => kind === "mesh");
+  for (const { link, kind, size, pose, color } of robot.shapes.filter((shape) => shape.kind !== "mesh")) {
     const [a, b] = [2 * size[0], size[1]];
     all[link].add(solid(kind, pose, { box: size, cylinder: [a, a, b], sphere: [a, a, a] }[kind], color.slice(0, 3)));
   }
   all.forEach((link) => (link.visible = false)); // until it is known where it is
   scene.set("robot", ...all);
+}
+
+/** The robot's meshes: nine numbers a triangle, `counts` of them from each file, one after the other. */
+function showMeshes(counts, body) {
+  let at = 0;
+  const files = counts.map((count) => {
+    const file = facets(new Float32Array(body, at, 9 * count));
+    at += 36 * count;
+    return file;
+  });
+  const all = [...links.values()];
+  for (const { link, mesh, size, pose, color } of meshes) all[link].add(faceted(files[mesh], pose, size, color.slice(0, 3)));
+  scene.redraw();
 }
 
 /** From the floor over the table top (0.4 m) and what stands on it to what is above. */
