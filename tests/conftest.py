@@ -28,6 +28,7 @@ from openarm_common.robot import folder
 os.environ["ROS_DOMAIN_ID"] = str(reserve_domain())
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ.pop(folder.ROBOT, None)  # a test that is about another robot than the default one says so
 
 # A run of the suite draws the same examples every time and times none; `--hypothesis-profile=explore` draws new ones.
 hypothesis.settings.register_profile("suite", deadline=None, derandomize=True)
