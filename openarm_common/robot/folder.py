@@ -188,11 +188,8 @@ def robot_hand() -> HandParts:
     Raises:
         OpenArmError: As `load_folder`; CONFIG_INVALID, when its `robot.yaml` does not say it.
     """
-    path, robot = load_folder(robot_name())
-    if robot.hand is None:
-        text = f"{path / 'robot.yaml'}:hand: missing; it says what the fingers are and can do"
-        raise OpenArmError(Code.CONFIG_INVALID, text)
-    return robot.hand
+    folder, robot = load_folder(robot_name())
+    return _said(robot.hand, f"{folder / 'robot.yaml'}:hand: missing; it says what the fingers are and can do")
 
 
 @per_robot
@@ -202,8 +199,12 @@ def robot_work() -> Work:
     Raises:
         OpenArmError: As `load_folder`; CONFIG_INVALID, when its `robot.yaml` does not say it.
     """
-    path, robot = load_folder(robot_name())
-    if robot.work is None:
-        text = f"{path / 'robot.yaml'}:work: missing; it says where the table and the objects before the robot are"
+    folder, robot = load_folder(robot_name())
+    where = "where the table and the objects before the robot are"
+    return _said(robot.work, f"{folder / 'robot.yaml'}:work: missing; it says {where}")
+
+
+def _said(part: R | None, text: str) -> R:
+    if part is None:
         raise OpenArmError(Code.CONFIG_INVALID, text)
-    return robot.work
+    return part
