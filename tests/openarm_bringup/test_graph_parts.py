@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from openarm_bringup.bags.ros.listener import flight_on_demand, profiles
-from openarm_bringup.supervision.graph import graph_names, load_graph
+from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.parts import for_each_part
 from openarm_calibration.config import CalibrationConfig
 from openarm_common.camera.cameras import (
@@ -22,6 +22,7 @@ from openarm_common.camera.cameras import (
     uncertain_cameras,
 )
 from openarm_common.errors import OpenArmError
+from openarm_common.resources import config_dir
 from openarm_common.robot import folder
 from openarm_common.robot.folder import load_folder
 from openarm_grasp.config import GraspConfig
@@ -106,7 +107,7 @@ def test_parameters_name_the_cameras_of_the_robot(two_eyes):
     assert flight_on_demand()[1] == "(/(left_wrist|right_wrist))?/detections_[23]d"
 
 
-@pytest.mark.parametrize("name", graph_names())
+@pytest.mark.parametrize("name", sorted(path.stem for path in (config_dir() / "graphs").glob("*.yaml")))
 def test_a_robot_with_one_arm_has_graphs_that_wait_for_it_alone(one_arm, name):
     graph = load_graph(name)
     assert spectator_camera() == "overhead"  # there is none for people
