@@ -138,6 +138,7 @@ class Simulation(ControlLoop):
         self._pacer.ticked(now_ns)
         if self._wall_stamps and abs(lag_ns := time.time_ns() - world.t_ns) > _LATE_NS:
             world.shift_time(lag_ns)
+            self._pacer.restart()  # what was made up now would run ahead, and stamps would go back
         try:
             self.robot.tick(steps)
         except OpenArmError as error:

@@ -49,7 +49,7 @@ def test_a_convex_mesh_is_one_shape_with_the_name_of_its_element_whatever_its_sc
     write_stl(tmp_path / "m.stl", WEDGE, FACES)
     link = RobotDescription.from_files(robot(tmp_path, scale="{} {} {}".format(*scale))).links["a"]
     (shape,) = link.collision
-    assert (shape.name, link.meshes, link.unread) == ("c", ("seen",), ())
+    assert (shape.name, len(link.meshes), link.unread) == ("c", 1, ())
     assert shape.corners is not None
     T = shape.T_link_primitive
     x, y, z = (WEDGE * scale).T

@@ -77,6 +77,28 @@ class Bench:
         return self.states[-1][1].t_ns if self.states else 0
 
 
+@pytest.mark.parametrize("halt_ms", [60, 150, 300, 450, 2000])
+def test_stamps_of_the_wall_clock_never_go_back_after_a_halt(monkeypatch: pytest.MonkeyPatch, halt_ms: int) -> None:
+    now, since = [0], 10**18
+    monkeypatch.setattr("openarm_sim_bridge.simulation.time.time_ns", lambda: since + now[0])
+    world, controller = make_controller()
+    world.shift_time(since)
+    stamps: list[int] = []
+
+    def observe(state: JointReadout) -> None:
+        stamps.append(state.t_ns)
+
+    robot = SimulatedRobot(RobotDescription.load(), world, controller)
+    simulation = Simulation(robot, observe, wall_stamps=True, clock=lambda: now[0])
+    for turn in range(300):
+        now[0] += max(round(simulation._turn() * 1e9), 100_000)
+        if turn == 100:
+            now[0] += halt_ms * 1_000_000
+    steps = np.diff(stamps)
+    assert steps.min() > 0
+    assert abs(since + now[0] - stamps[-1]) < 100_000_000
+
+
 @pytest.fixture
 def bench() -> Iterator[Bench]:
     out = Bench()

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from control_msgs.msg import JointTrajectoryControllerState
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from openarm_bringup.calibration.ros.dynamics import pieces
 from openarm_bringup.commands.calibrate_live import dynamics
@@ -39,9 +40,12 @@ def identify(bench, **options) -> Outcome:
 
 def test_servos_are_identified_stored_and_used(ros, bridge) -> None:
     bench = bridge(images=False, profile="openarm", openarm__dynamics_seed=7)
+    said = bench.collect(DiagnosticArray, "/diagnostics", 10)
     # signs of life are not exchanged within a process
     motion = subprocess.Popen([sys.executable, "-m", "openarm_motion.ros.node"])
     try:
+        able = {("motion: status", DiagnosticStatus.OK)}  # it has joint states; `openarm up` waits for that, too
+        ros.spin_until(lambda: able & {(s.name, s.level) for m in said for s in m.status}, 60.0, "the motion node")
         done = identify(bench, arm="right", postures=2)
     finally:
         motion.terminate()
