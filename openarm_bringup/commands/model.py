@@ -98,7 +98,7 @@ def new(
 
 @model.command
 def semantics(name: str) -> Outcome:
-    """Write the SRDF of a robot anew from its `semantics.yaml`, with a sampled collision matrix; takes minutes.
+    """Write the SRDF of a robot from its `semantics.yaml`, with a sampled collision matrix; takes minutes.
 
     Args:
         name: Of the robot.

@@ -64,7 +64,7 @@ def take_meshes(
     """Read the collision meshes of a robot; names of files become absolute in the document.
 
     A mesh that is convex is taken as it is, another becomes few convex hulls. No point of a mesh is outside its hulls;
-    how far these reach beyond it is up to its hollows. Visual meshes are not read, and may be missing.
+    how far these reach beyond it is up to its hollows. Visual meshes are not read here.
 
     Args:
         robot: The <robot> document, changed.
@@ -81,7 +81,7 @@ def take_meshes(
         try:
             mesh.set("filename", _absolute(mesh_file(mesh.get("filename", ""), urdf, packages)))
         except OpenArmError:
-            continue  # nothing that the suite does needs it; `openarm model check` says so
+            continue  # the simulation and the page need it, and say so; `openarm model check`, too
     hulls: dict[str, tuple[Primitive, ...]] = {}
     for link in robot.findall("link"):
         name, found = link.get("name", ""), list[Primitive]()

@@ -157,7 +157,7 @@ def _links_to(robot: RobotDescription, link: str) -> set[str]:
 
 
 def _adopted(source: Path, folder: Path) -> str:
-    """URDF text with a name for each shape, and mesh files beside it in the folder; those of packages stay there."""
+    """URDF text with a name for each shape, and mesh files in its folder; those of packages stay there."""
     root = parse_root(read_text(source), str(source))
     taken = {shape.get("name") for tag in ("visual", "collision") for shape in root.findall(f"link/{tag}")}
     for link in root.findall("link"):

@@ -23,7 +23,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import read_folder
 from openarm_sim_bridge.drafting.collisions import LinkContacts, Pair, adjacent_pairs, mirror_links
 
-#: File beside the SRDF that it is written from.
+#: File of the robot's folder that the SRDF is written from.
 SOURCE = "semantics.yaml"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm model`: a robot drafted, checked, and its SRDF written anew."""
+"""`openarm model`: a robot drafted, checked, and its SRDF written."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def call(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict[str,
 
 def test_a_robot_is_drafted_checked_and_its_srdf_written_anew(robots, tmp_path, capsys):
     new = ("new", "mine", "--mjcf", str(tmp_path / "r.xml"), "--out", str(robots), "--samples", "50")
-    code, told = call(capsys, *new, "--arm", "one=base_link:a")
-    assert (code, told["success"]) == (0, True)
-    assert any("velocity" in fault for fault in told["faults"])  # type: ignore[union-attr]
-    code, told = call(capsys, "check", "mine")
-    assert (code, told["code"]) == (1, "CONFIG_INVALID")
-    assert told["message"] == f"mine: {len(told['faults'])} faults"  # type: ignore[arg-type]
+    code, answer = call(capsys, *new, "--arm", "one=base_link:a")
+    assert (code, answer["success"]) == (0, True)
+    assert any("velocity" in fault for fault in answer["faults"])  # type: ignore[union-attr]
+    code, answer = call(capsys, "check", "mine")
+    assert (code, answer["code"]) == (1, "CONFIG_INVALID")
+    assert answer["message"] == f"mine: {len(answer['faults'])} faults"  # type: ignore[arg-type]
     path = robots / "mine" / "semantics.yaml"
     source = yaml.safe_load(path.read_text())
     assert source["samples"] == 50
@@ -62,13 +62,13 @@ def test_a_robot_of_the_suite_is_right(capsys):
         (["new", "mine"], "expected one of --mjcf and --urdf"),
         (["new", "../mine", "--urdf", "r.urdf"], "names no robot"),
         (["new", "mine", "--urdf", "r.urdf", "--arm", "one=a"], "expected NAME=BASE_LINK:TIP_LINK"),
-        (["check", "nobody"], "no robot 'nobody'; robots: "),
-        (["semantics", "nobody"], "no robot 'nobody'; robots: "),
+        (["check", "absent"], "no robot 'absent'; robots: "),
+        (["semantics", "absent"], "no robot 'absent'; robots: "),
         (["sdf"], "sdf"),
     ],
 )
 def test_a_wrong_call_is_refused(robots, capsys, argv, words):
-    code, told = call(capsys, *argv)
-    assert (code, told["success"]) == (2, False)
-    assert words in str(told["message"])
+    code, answer = call(capsys, *argv)
+    assert (code, answer["success"]) == (2, False)
+    assert words in str(answer["message"])
     assert not list(robots.iterdir())
