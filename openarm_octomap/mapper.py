@@ -15,7 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from openarm_common.camera.cameras import CameraConfig
 from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
+from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.blocks import CellSet
 from openarm_common.octree.codec import Payload, encode_states, read_file, write_file
@@ -121,13 +123,18 @@ class Mapper:
         self, description: RobotDescription, grid: GridConfig, robot: FilterConfig, distances: FieldConfig
     ) -> None:
         self._grid, self._robot = OccupancyGrid(grid), description.name
-        self._filter = SelfFilter(description, robot)
+        self._description, self._config = description, robot
+        self.mount({})
         self._filtering = robot.enabled
         self._reset_padding = robot.reset_padding
         self._flying = robot.flying
         self._transform = DistanceTransform(self._grid.lattice, distances.reach, distances.unknown)
         self._lock = threading.Lock()
         self._edition = 0
+
+    def mount(self, cameras: Mapping[str, CameraConfig]) -> None:
+        """Take the housings of cameras, by name, at these mounts for a part of the robot from now on."""
+        self._filter = SelfFilter(with_housings(self._description, cameras.values()), self._config)
 
     @property
     def edition(self) -> int:

@@ -3,17 +3,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Primitive, RobotDescription
+from openarm_common.types import Array
+
+
+def mounted(cameras: Mapping[str, CameraConfig], mounts: Mapping[str, Array]) -> dict[str, CameraConfig]:
+    """Return the cameras, by name, at calibrated mounts.
+
+    Args:
+        cameras: By name.
+        mounts: T_parent_link (4, 4) by camera; those left out stay where they are.
+    """
+    moved = dict(cameras)
+    for name, T in mounts.items():
+        pose = {"position": T[:3, 3].tolist(), "forward": T[:3, 0].tolist(), "image_right": (-T[:3, 1]).tolist()}
+        moved[name] = cameras[name].model_copy(update={key: tuple(value) for key, value in pose.items()})
+    return moved
 
 
 def with_housings(description: RobotDescription, cameras: Iterable[CameraConfig]) -> RobotDescription:
-    """Return the description with each camera's housing, at its nominal mount, among its parent's collision shapes.
+    """Return the description with each camera's housing, at its mount, among its parent's collision shapes.
 
     The URDF text is left as it is: a housing belongs to a mount, and mounts are not part of the robot.
 

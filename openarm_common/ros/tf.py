@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.subscription import Subscription
@@ -17,6 +18,8 @@ from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
+from openarm_common.camera.cameras import CameraConfig, load_cameras
+from openarm_common.camera.housings import mounted
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.posture import PostureTracker
@@ -64,6 +67,8 @@ class RobotStateListener:
         self._users: set[object] = set()
         self._watchers: list[Callable[[], None]] = []
         self._on_table: Callable[[float], None] | None = None
+        self._on_mounts: Callable[[dict[str, CameraConfig]], None] | None = None
+        self._cameras: dict[str, CameraConfig] = {}
         self._joints: Subscription | None = None
         node.create_subscription(TFMessage, "/tf_static", self._on_static, QOS_STATIC_TF)
         if held_topic:
@@ -90,6 +95,13 @@ class RobotStateListener:
         """Call a function with the height of the frame `table`, base frame, m, whenever it is published."""
         self._on_table = on_height
 
+    def follow_mounts(self, on_mounts: Callable[[dict[str, CameraConfig]], None]) -> None:
+        """Call a function with the robot's cameras, by name, whenever one with a housing is mounted elsewhere.
+
+        They begin as in the configuration, and follow the transforms from their parents.
+        """
+        self._on_mounts, self._cameras = on_mounts, load_cameras()
+
     def age_s(self) -> float:
         """Return the seconds of wall clock since the newest joint state arrived; infinite before the first."""
         return self.tracker.age_s(time.monotonic())
@@ -103,11 +115,14 @@ class RobotStateListener:
 
     def _on_static(self, message: TFMessage) -> None:
         refused: OpenArmError | None = None
+        before = self._cameras
         for edge in message.transforms:
             try:
                 self._add_edge(edge)
             except OpenArmError as error:
                 refused = error
+        if self._on_mounts is not None and self._cameras is not before:
+            self._on_mounts(self._cameras)
         self._notify()
         if refused is not None:
             raise refused
@@ -117,6 +132,11 @@ class RobotStateListener:
         self.buffer.set_static(edge.header.frame_id, edge.child_frame_id, T)
         if edge.child_frame_id == TABLE_FRAME and self._on_table is not None:
             self._on_table(float(T[2, 3]))
+        for name, camera in self._cameras.items():
+            if camera.housing is None or camera.link_frame != edge.child_frame_id:
+                continue
+            if camera.parent == edge.header.frame_id and not np.allclose(camera.T_parent_link, T, atol=1e-5):
+                self._cameras = mounted(self._cameras, {name: T})
 
     def _on_held(self, message: MarkerArray) -> None:
         self.tracker.held = held_from_msg(message)

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from openarm_common.camera.cameras import load_cameras
-from openarm_common.camera.housings import with_housings
+from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.distance_field import CameraMoment, DistanceField
 from openarm_common.robot.description import RobotDescription
@@ -23,12 +22,15 @@ class SimulatedMap:
     Args:
         description: The robot.
         config: Parameters of the octomap node.
+        cameras: At their mounts as the suite believes, by name.
     """
 
-    def __init__(self, description: RobotDescription, config: OctomapNodeConfig) -> None:
+    def __init__(
+        self, description: RobotDescription, config: OctomapNodeConfig, cameras: Mapping[str, CameraConfig]
+    ) -> None:
         self.config = config
-        body = with_housings(description, load_cameras().values())
-        self._mapper = Mapper(body, config.grid, config.filter, config.field)
+        self._mapper = Mapper(description, config.grid, config.filter, config.field)
+        self._mapper.mount(cameras)
         self._distances = np.empty(self._mapper.lattice.shape, np.float32)
         self._frame = description.root
         self._moments = {name: CameraMoment(0, 0) for name in config.cameras}

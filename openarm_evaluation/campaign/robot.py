@@ -21,6 +21,7 @@ from pydantic import Field
 from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, detector_nodes, load_cameras
 from openarm_common.camera.depth_view import DepthView
+from openarm_common.camera.housings import mounted
 from openarm_common.config import Config, load_config
 from openarm_common.errors import OpenArmError
 from openarm_common.resources import config_dir
@@ -139,7 +140,8 @@ class SimRobot:
         self.tracks: dict[str, list[Sample]] = {item.name: [] for item in scene.objects}
         self.trace: deque[tuple[int, Array, Array]] = deque(maxlen=int(_TRACE_S * 1e9) // self.world.period_ns)
         self.images: dict[str, tuple[int, NDArray[np.uint8], DepthImage]] = {}
-        self._mounts = dict(mounts or {})
+        #: The cameras where the suite believes that they are mounted.
+        self._mounted = mounted(self.cameras, mounts or {})
         self._arriving: deque[tuple[int, Frame]] = deque()
         self.frames: deque[Frame] = deque(maxlen=64)
         #: What the hands hold, as the planner believes; the detector takes it for a part of the robot.
@@ -151,9 +153,9 @@ class SimRobot:
         self._published_ns = 0
         #: How long plans took, s of wall clock.
         self.planning_s: list[float] = []
-        self.map = SimulatedMap(self.description, suite.octomap)
+        self.map = SimulatedMap(self.description, suite.octomap, self._mounted)
         self._controllers = {arm: _ArmController(self, arm) for arm in self.simulated.controller.arms}
-        arms = arms_behind(self._sets, self.table)
+        arms = arms_behind(self._sets, self.table, tuple(self._mounted.values()))
         self.motion = MotionService(self, suite.motion, arms, self.map, (self.description.root,))
         self.motion.on_held = self._take_held
         self._note()
@@ -341,7 +343,7 @@ class SimRobot:
             joints = self.states.joints_at(min(stamp_ns, newest_ns))
         except OpenArmError:
             return None
-        return _finder(self._sets, name).find(view, joints, self.held)[0]
+        return _finder(self._sets, name, tuple(self._mounted.values())).find(view, joints, self.held)[0]
 
     def draw(self, name: str) -> tuple[NDArray[np.uint8], DepthImage]:
         """Colour and depth (mm) that a camera sees now; the same image for whoever asks in this tick."""
@@ -361,7 +363,7 @@ class SimRobot:
         Raises:
             OpenArmError: STALE_DATA, when the camera rides on a joint of which the stamp knows nothing.
         """
-        T_parent_link = self._mounts.get(camera.name, camera.T_parent_link)
+        T_parent_link = self._mounted[camera.name].T_parent_link
         T_link_optical = se3.inverse(camera.T_parent_link) @ camera.T_parent_optical
         T_base_parent = self.states.lookup(self.description.root, camera.parent, stamp_ns)
         return T_base_parent @ T_parent_link @ T_link_optical
@@ -415,21 +417,26 @@ class _Goal:
             self._follower.cancel()
 
 
-def arms_behind(sets: tuple[str, ...], table: Table) -> Mapping[str, Arm]:
-    """Return the arms of the motion service behind a table; made once a process."""
+def arms_behind(
+    sets: tuple[str, ...], table: Table, cameras: tuple[CameraConfig, ...] | None = None
+) -> Mapping[str, Arm]:
+    """Return the arms of the motion service behind a table, with cameras at their mounts; made once a process."""
     motion = suite_config(sets).motion.model_copy(update={"faults": FaultsConfig()})
-    return _arms(motion.model_dump_json(), table.model_dump_json())
+    return _arms(motion.model_dump_json(), table.model_dump_json(), cameras)
 
 
 @per_robot
-def _arms(config: str, table: str) -> Mapping[str, Arm]:
+def _arms(config: str, table: str, cameras: tuple[CameraConfig, ...] | None) -> Mapping[str, Arm]:
     fixed = (table_box(Table.model_validate_json(table)),)
-    return make_arms(MotionConfig.model_validate_json(config), RobotDescription.load(), fixed)
+    by_name = None if cameras is None else {camera.name: camera for camera in cameras}
+    return make_arms(MotionConfig.model_validate_json(config), RobotDescription.load(), fixed, by_name)
 
 
 @per_robot
-def _finder(sets: tuple[str, ...], camera: str) -> RobotFinder:
-    return RobotFinder(RobotDescription.load(), suite_config(sets).detectors[camera].self_filter)
+def _finder(sets: tuple[str, ...], camera: str, cameras: tuple[CameraConfig, ...]) -> RobotFinder:
+    finder = RobotFinder(RobotDescription.load(), suite_config(sets).detectors[camera].self_filter)
+    finder.mount({one.name: one for one in cameras})
+    return finder
 
 
 @per_robot

@@ -18,6 +18,7 @@ from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from visualization_msgs.msg import MarkerArray
 
+from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.distance_field import DistanceFieldReader, field_path
 from openarm_common.ros.actions import ActionServer
@@ -71,6 +72,7 @@ class MotionNode(BaseNode[MotionConfig]):
         self._show_held()
         self._show_scene()
         self.robot.listener.follow_table(self._take_table)
+        self.robot.listener.follow_mounts(self._take_mounts)
         self._servers = [
             self._serve(PlanApproach, "/motion/plan_approach", self._on_plan),
             self._serve(MoveArm, "/motion/move", self._on_move),
@@ -83,6 +85,9 @@ class MotionNode(BaseNode[MotionConfig]):
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
         for arm in arms.values():
             self.get_logger().info(f"{arm.name} arm: {', '.join(arm.names)}; inverse kinematics: {arm.inverse.method}")
+
+    def _take_mounts(self, cameras: Mapping[str, CameraConfig]) -> None:
+        self.service.mount(make_arms(self.config, self.description, (), cameras))
 
     def _take(self, config: MotionConfig) -> None:
         """Inject faults as configured, from the next plan on."""

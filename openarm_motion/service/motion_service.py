@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
@@ -79,15 +79,21 @@ def table_box(table: Table) -> Box:
     return box_from("table", (x, y, table.top_z - 0.5 * table.thickness), table.extents)
 
 
-def make_arms(config: MotionConfig, description: RobotDescription, fixed: Sequence[Box]) -> dict[str, Arm]:
+def make_arms(
+    config: MotionConfig,
+    description: RobotDescription,
+    fixed: Sequence[Box],
+    cameras: Mapping[str, CameraConfig] | None = None,
+) -> dict[str, Arm]:
     """Make the arms of a robot with its cameras mounted.
 
     Args:
         config: Parameters.
         description: The robot.
         fixed: Boxes that are always there (the table), base frame.
+        cameras: By name, at their mounts; None: those of this process's robot, where the configuration says.
     """
-    body = with_housings(description, load_cameras().values())
+    body = with_housings(description, (load_cameras() if cameras is None else cameras).values())
     return {name: Arm(name, body, config, fixed) for name in config.arms or body.arm_names}
 
 
@@ -110,7 +116,8 @@ class MotionService:
         field: FieldSource,
         frames: Sequence[str],
     ) -> None:
-        self.robot, self.config, self.arms, self._frames = robot, config, arms, tuple(frames)
+        self.robot, self.config, self._frames = robot, config, tuple(frames)
+        self.arms = arms = dict(arms)
         self.faults = PlanFaults(config.faults)
         #: No new motion is begun, and those under way hold.
         self.closing = False
@@ -320,6 +327,12 @@ class MotionService:
         for arm in self.arms.values():
             arm.static = tuple(fixed)
         self.scene.fix(fixed)
+
+    def mount(self, arms: Mapping[str, Arm]) -> None:
+        """Plan with these arms, from `make_arms`, in place of those of the same names, from the next request on."""
+        for name, arm in arms.items():
+            arm.static = self.arms[name].static
+        self.arms.update(arms)
 
     def check_map(self) -> str:
         """Return how old the map is, or why it is not used.

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from openarm_common.camera.cameras import depth_camera, load_cameras
-from openarm_common.camera.housings import with_housings
 from openarm_common.errors import OpenArmError
 from openarm_common.octree.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.robot.held import HeldBox
@@ -33,13 +32,14 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("octomap", OctomapNodeConfig, **kwargs)
         config = self.config
-        body = with_housings(self.description, load_cameras().values())
-        self._mapper = Mapper(body, config.grid, config.filter, config.field)
+        self._mapper = Mapper(self.description, config.grid, config.filter, config.field)
         if config.map_file:
             self._mapper.load(Path(config.map_file).expanduser())
         self._states = RobotStateListener(
             self, self.description, joints=False, depth=100, wait=config.transform_wait, held_topic=config.held_topic
         )
+        self._mapper.mount(load_cameras())
+        self._states.follow_mounts(self._mapper.mount)
         need: JointNeed = "required" if config.filter.enabled else "none"
         topics = {"depth": config.depth_topic, "info": config.info_topic}
         cameras = [depth_camera(name) for name in config.cameras]

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from pydantic import Field
 
-from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.camera.housings import with_housings
 from openarm_common.robot.description import RobotDescription
@@ -38,7 +38,12 @@ class RobotFinder:
     """
 
     def __init__(self, description: RobotDescription, config: SelfFilterConfig) -> None:
-        self._filter = SelfFilter(with_housings(description, load_cameras().values()), config)
+        self._description, self._config = description, config
+        self.mount(load_cameras())
+
+    def mount(self, cameras: Mapping[str, CameraConfig]) -> None:
+        """Find the housings of cameras, by name, at these mounts from now on."""
+        self._filter = SelfFilter(with_housings(self._description, cameras.values()), self._config)
 
     def find(
         self, view: DepthView, joints: Mapping[str, float], held: Sequence[HeldBox] = ()

@@ -135,6 +135,8 @@ class CloudNode(BaseNode[CloudNodeConfig]):
             wait=config.transform_wait,
             held_topic=config.held_topic if finder else "",
         )
+        if finder is not None:
+            self.states.follow_mounts(finder.mount)
         self._merged = self.create_publisher(PointCloud2, config.merged_topic, QOS_SENSOR)
         self._merger = CloudMerger(config.cameras, config.merged_age)
         self._points = {

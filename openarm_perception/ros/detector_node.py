@@ -79,6 +79,8 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self, self.description, joints=False, depth=100, wait=config.transform_wait,
             held_topic=config.held_topic if cuts else "",
         )  # fmt: skip
+        if self._robot is not None:
+            states.follow_mounts(self._robot.mount)
         if config.table_height is None:
             states.follow_table(self._take_table)
         # without a depth topic, objects of known height are located by colour alone

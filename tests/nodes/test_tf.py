@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TransformStamped
@@ -10,10 +11,12 @@ from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
+from openarm_common import se3
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.config import Config
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.convert import ns_to_stamp
-from openarm_common.ros.node import QOS_LATCHED, BaseNode, reliable
+from openarm_common.ros.convert import matrix_to_transform, ns_to_stamp
+from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF, BaseNode, reliable
 from openarm_common.ros.tf import RobotStateListener
 
 
@@ -99,3 +102,27 @@ def test_joint_states_are_subscribed_to_while_any_user_wants_them(ros) -> None:
     ros.spin_until(subscribers, what="one user is left")
     listener.enable(False, "second")
     ros.spin_until(lambda: not subscribers(), what="none is left")
+
+
+def test_cameras_with_a_housing_follow_the_transforms_from_their_parents(ros) -> None:
+    """A mount of calibration: of the wrist; what is no mount of a camera, or as before, is no news."""
+    listener = RobotStateListener(ros.add(BaseNode("eye", Config)), RobotDescription.load())
+    news = []
+    listener.follow_mounts(news.append)
+    camera = load_cameras()["wrist"]
+    T = camera.T_parent_link @ se3.make(se3.rot_z(0.02), (0.01, -0.004, 0.003))
+    static = ros.node.create_publisher(TFMessage, "/tf_static", QOS_STATIC_TF)
+    mounts = [
+        matrix_to_transform(camera.parent, camera.link_frame, T, 0),
+        matrix_to_transform("openarm_body_link0", camera.link_frame, np.eye(4), 0),  # of another parent
+        matrix_to_transform(camera.parent, "spectator_link", np.eye(4), 0),
+    ]
+    static.publish(TFMessage(transforms=mounts))
+    ros.spin_until(lambda: news, what="the mount")
+    assert np.allclose(news[0]["wrist"].T_parent_link, T)
+    assert news[0]["overhead"] == load_cameras()["overhead"]
+    heard = []
+    listener.watch(lambda: heard.append(True))
+    static.publish(TFMessage(transforms=mounts))
+    ros.spin_until(lambda: heard, what="the second message")
+    assert len(news) == 1

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.housings import mounted
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_control.trajectory import JointSpline
 from openarm_motion.collision.exact import CollisionScene
@@ -18,7 +21,7 @@ from openarm_motion.collision.solids import Sphere
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.approach import ApproachRequest, Target
 from openarm_motion.planning.arm import Arm
-from openarm_motion.service.motion_service import MotionService
+from openarm_motion.service.motion_service import MotionService, make_arms
 from openarm_motion.service.requests import (
     ArmGoal,
     ExecuteRequest,
@@ -190,6 +193,22 @@ def test_plan_only_sends_nothing_and_the_plan_is_executed_later(bench) -> None:
     motion = plan.trajectory
     (answer,) = bench.run(bench.service.execute(ExecuteRequest("right", motion, scene_version=plan.scene_version)))
     assert answer.code is Code.OK
+
+
+def test_a_camera_is_where_it_is_mounted(bench, table) -> None:
+    """A ball 3 cm from the nominal housing is in the way of one whose mount was calibrated to be there."""
+    plain, cameras = RobotDescription.load(), load_cameras()
+    T = cameras["wrist"].T_parent_link @ se3.make(None, (-0.03, 0.03, 0.03))
+    parent = plain.link_pose(cameras["wrist"].parent, bench.robot.state)
+    ball = Sphere("ball", parent @ T @ cameras["wrist"].T_link_housing, 0.004)
+    bench.service.apply_scene(clear=False, remove=(), add=[ball])
+    (before,) = bench.run(bench.move(plan_only=True))
+    assert before.code is Code.OK
+    bench.service.mount(make_arms(MotionConfig(), plain, (), mounted(cameras, {"wrist": T})))
+    (after,) = bench.run(bench.move(plan_only=True))
+    assert after.code is Code.IN_COLLISION
+    assert f"{cameras['wrist'].parent} would hit ball" in after.message
+    assert bench.service.arms["right"].static == (table,)
 
 
 def test_a_plan_of_another_scene_is_not_executed(bench) -> None:
