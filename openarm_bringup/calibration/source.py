@@ -30,7 +30,8 @@ class Source:
         exclude: Names of samples to leave out.
         store: Folder of stored calibrations.
         camera: Of a bag: whose images are used; needed when it has several.
-        board: Of a bag: keys of the board as YAML, such as "{kind: charuco}"; 4x11 circles when not given.
+        board: Of a bag: the board, such as charuco:7x5:34mm:26mm:DICT_6X6_250, its keys as YAML, or a YAML file; 4x11
+            circles when not given.
         carrier: Of a bag: link that holds the board when the camera is fixed; that of the right hand when not given.
         mount_seed: Of a bag: of simulated mounts; what it says of itself when not given.
         session: Of a bag: file (.npz) to write the samples to.
@@ -80,7 +81,8 @@ def with_solved(
     Raises:
         OpenArmError: What is wrong with the file or the options; DEGENERATE, when a session determines nothing.
     """
-    from openarm_calibration.handeye.offline import REFINED, calibrate, checked_algorithm, without_named
+    from openarm_calibration.handeye.closed_form import REFINED
+    from openarm_calibration.handeye.offline import calibrate, checked_algorithm, without_named
     from openarm_calibration.handeye.solve import SolveConfig
     from openarm_common.records import now
 
@@ -130,7 +132,7 @@ def _from_bag(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--session {session}: expected a name that ends in .npz")
     if source.mount_seed is not None and source.mount_seed < 0:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--mount-seed {source.mount_seed}: expected 0 or more")
-    board = _board(source.board)
+    board = given_board(source.board)
     with open_bag(path) as bag:
         require_robot(bag)
         samples, found = samples_of(bag, source.camera, board, source.carrier, source.mount_seed)
@@ -138,7 +140,12 @@ def _from_bag(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str
     return samples, digest, stills.rows(found), stills.summary(found)
 
 
-def _board(text: str) -> Board:
+def given_board(text: str) -> Board:
+    """Return the board of an option `--board`.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, with what is valid.
+    """
     from openarm_calibration.board.board import read_board
 
     try:

@@ -4,11 +4,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from cyclopts import App
 
-from openarm_bringup.calibration.source import ALL_SAMPLES, Solved, Source, store_in, tables_in, with_solved
+from openarm_bringup.calibration.source import (
+    ALL_SAMPLES,
+    Solved,
+    Source,
+    given_board,
+    store_in,
+    tables_in,
+    with_solved,
+)
 from openarm_bringup.commands import calibrate_live
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
@@ -26,38 +34,19 @@ calibrate.command(calibrate_live.dynamics)
 
 
 @calibrate.command
-def board(
-    out: Path,
-    *,
-    kind: Literal["circles", "charuco"] = "circles",
-    columns: int | None = None,
-    rows: int | None = None,
-    spacing: float | None = None,
-    diameter: float | None = None,
-    border: float | None = None,
-    dpi: int = 300,
-) -> Outcome:
+def board(out: Path, *, board: str = "circles", dpi: int = 300) -> Outcome:
     """Write a calibration board: .png or .pdf true to scale for a printer, .xml (MJCF) for a simulated scene.
 
     Args:
         out: File to write; its ending chooses the form.
-        kind: An asymmetric circle grid, or ChArUco.
-        columns: Circles in a row (4), or squares in a row (7).
-        rows: Rows of circles (11, odd), or of squares (5).
-        spacing: Between rows of circles (0.02), or edge of a square (0.034), m.
-        diameter: Of a circle (0.015), or edge of a marker (0.026), m.
-        border: White around the marks, m.
+        board: In a word, such as circles:4x11:20mm:15mm, symmetric_circles:7x6:30mm:15mm, chessboard:8x5:25mm,
+            charuco:7x5:34mm:26mm:DICT_5X5_100, aprilgrid:6x6:24mm:0.3 or marker:100mm:DICT_APRILTAG_36h11:id=0; or its
+            keys as YAML, or a YAML file, also of Kalibr.
         dpi: Of a PNG.
     """
-    from openarm_calibration.board.board import parse_board
     from openarm_calibration.board.board_files import write_board
 
-    given = {"columns": columns, "rows": rows, "spacing": spacing, "diameter": diameter, "border": border}
-    chosen = {key: value for key, value in given.items() if value is not None}
-    try:
-        made = parse_board({"kind": kind, **chosen}, "board")
-    except OpenArmError as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, error.message) from error
+    made = given_board(board)
     message = write_board(made, out, dpi)
     return Outcome(True, message, data={"written": str(out), "board": made.model_dump(), "size": list(made.size)})
 

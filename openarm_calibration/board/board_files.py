@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from openarm_calibration.board.board import Board, Charuco, CircleGrid
+from openarm_calibration.board.board import Board
+from openarm_calibration.board.circles import CircleGrid, SymmetricCircles
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.figures import METRE, render_figure, sheet
 from openarm_common.types import Array
@@ -19,6 +20,8 @@ _A4 = (0.210, 0.297)
 _MARGIN = 0.008  # that printers can't reach, m
 _THICKNESS = 0.003
 _OVERLAP = 1e-5  # of neighbouring modules, so that no viewer shows a seam, m
+#: Corners of a box of (left, top, right, bottom), in turn.
+_CORNERS = (0, 1, 2, 1, 2, 3, 0, 3)
 #: Edge of a simulated board's texture, pixels. A power of two: half of an odd edge is no whole number of pixels, so
 #: that the smaller copies that a renderer makes of it do not quite lie on it, and the board seems 0.06 % too large.
 TEXTURE_EDGE = 2048
@@ -78,11 +81,12 @@ def pdf(board: Board) -> bytes:
     page = pages[0] if pages else (max(width, 0.12) + 2 * _MARGIN, tall + 2 * _MARGIN)
     axes = sheet(*page, unit=METRE)
     centre = np.array([page[0] / 2.0, (page[1] - tall + height) / 2.0])
-    if isinstance(board, CircleGrid):
+    if isinstance(board, CircleGrid | SymmetricCircles):
         for mark in board.points[:, :2] + centre:
             axes.add_patch(Circle((mark[0], mark[1]), board.radius, color="black", lw=0.0))
     else:
-        axes.add_collection(PolyCollection([*(_squares(board) + centre)], color="black", lw=0.0))
+        boxes = _without_seams(board.boxes) + np.tile(centre, 2)
+        axes.add_collection(PolyCollection([*boxes[:, _CORNERS].reshape(-1, 4, 2)], color="black", lw=0.0))
     start, base = (page[0] - 0.1) / 2.0, centre[1] + height / 2.0 + 0.010
     axes.broken_barh([(start, 0.1)], (base - 0.001, 0.001), color="black", lw=0.0)
     axes.broken_barh([(x - 0.0001, 0.0002) for x in (start, start + 0.1)], (base - 0.003, 0.005), color="black", lw=0.0)
@@ -90,23 +94,13 @@ def pdf(board: Board) -> bytes:
     return render_figure(axes, "pdf")
 
 
-def _squares(board: Charuco) -> Array:
-    """Return the corners (n, 4, 2) of black squares and marker modules, m from the middle of the board."""
-    drawn, dictionary = board.board, board.board.getDictionary()
-    markers = np.array(drawn.getObjPoints(), dtype=np.float64)[
-        :, :, :2
-    ]  # from the upper left corner of each, clockwise
-    white = (markers.mean(axis=1) // board.spacing).astype(int).tolist()
-    cells = [[column, row] for row in range(board.rows) for column in range(board.columns)]
-    boxes = [(*np.multiply(cell, board.spacing), board.spacing) for cell in cells if cell not in white]
-    modules = dictionary.markerSize + 2
-    edge = board.diameter / modules
-    for number, corner in zip(np.ravel(drawn.getIds()), markers[:, 0], strict=True):
-        black = np.argwhere(cv2.aruco.generateImageMarker(dictionary, int(number), modules) == 0)
-        boxes += [(*(corner + place * edge), edge + _OVERLAP) for place in black[:, ::-1]]
-    corners = np.array(boxes)[:, None]
-    square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-    return corners[..., :2] + corners[..., 2:] * square - np.array([board.columns, board.rows]) * board.spacing / 2.0
+def _without_seams(boxes: Array) -> Array:
+    """Return boxes (n, 4) of which those that stand on another one reach a little into it."""
+    stands = np.abs(boxes[:, None, 3] - boxes[None, :, 1]) < 1e-9
+    stands &= (boxes[:, None, 0] < boxes[None, :, 2] - 1e-9) & (boxes[None, :, 0] < boxes[:, None, 2] - 1e-9)
+    out = boxes.copy()
+    out[stands.any(axis=1), 3] += _OVERLAP
+    return out
 
 
 def mesh(board: Board) -> tuple[list[float], list[float], list[int]]:

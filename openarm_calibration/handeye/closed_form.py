@@ -23,6 +23,9 @@ HAND_EYE = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
 #: AX = ZB: both mounts at once.
 ROBOT_WORLD = ("SHAH", "LI")
 METHODS = (*HAND_EYE, *ROBOT_WORLD)
+#: The refinement, and all that a stored mount may be of.
+REFINED = "REFINED"
+ALGORITHMS = (REFINED, *METHODS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from openarm_calibration.handeye.closed_form import METHODS, closed_form
+from openarm_calibration.handeye.closed_form import ALGORITHMS, REFINED, closed_form
 from openarm_calibration.handeye.observability import condition_number, require_motion
 from openarm_calibration.handeye.problem import Problem, View, assemble
 from openarm_calibration.handeye.refine import Estimate, invert_scaled, mount_error
@@ -29,10 +29,6 @@ from openarm_common.errors import Code, OpenArmError
 
 #: Postures within this of each other have the same error of the robot, rad or m.
 _SAME_POSTURE = 1e-3
-
-
-REFINED = "REFINED"
-ALGORITHMS = (REFINED, *METHODS)
 
 
 @dataclass(frozen=True, eq=False)

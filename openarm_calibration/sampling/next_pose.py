@@ -285,7 +285,7 @@ class PoseSearch:
         optics = samples.head.optics
         pixels = optics.project(views[:, :3, 3])
         inside = (pixels > 0.0).all(axis=1) & (pixels < (optics.width, optics.height)).all(axis=1)
-        large = optics.fx * samples.board.diameter / np.maximum(views[:, 2, 3], 1e-6) > self._config.smallest
+        large = optics.fx * samples.board.feature / np.maximum(views[:, 2, 3], 1e-6) > self._config.smallest
         return inside & large
 
     def _ranked(self, samples: SampleSet, Z: Array, found: list[tuple[Array, Array]]) -> list[tuple[float, Array]]:

@@ -76,11 +76,11 @@ def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_p
 
 
 @pytest.mark.parametrize("name", ["board.png", "board.pdf", "board.xml"])
-@pytest.mark.parametrize("kind", ["circles", "charuco"])
+@pytest.mark.parametrize("board", ["circles", "charuco:9x6:30mm:22mm:DICT_6X6_250", "{kind: marker, id: 3}"])
 @pytest.mark.requirement("A-43")
-def test_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) -> None:
+def test_boards_are_written(capsys, tmp_path: Path, name: str, board: str) -> None:
     path = tmp_path / "new" / name
-    code, out, _ = run(capsys, "board", str(path), "--kind", kind)
+    code, out, _ = run(capsys, "board", str(path), "--board", board)
     assert code == 0
     assert path.stat().st_size > 500
     assert "mm" in out
@@ -128,8 +128,9 @@ def test_a_stored_file_that_would_run_something_is_reported_and_not_run(capsys, 
     [
         (["board"], 2, "out"),
         (["board", "b.gif"], 2, "written as .png, .pdf, .xml"),
-        (["board", "b.png", "--rows", "10"], 2, "odd"),
-        (["board", "b.png", "--kind", "dots"], 2, "dots"),
+        (["board", "b.png", "--board", "circles:4x10"], 2, "odd"),
+        (["board", "b.png", "--board", "dots"], 2, "charuco:7x5:34mm:26mm:DICT_5X5_100"),
+        (["board", "b.png", "--board", "charuco:7x5:DICT_9X9"], 2, "DICT_6X6_250"),
         (["board", "b.png", "--dpi", "7"], 2, "expected 50 to 2400"),
         (["solve"], 2, "samples"),
         (["solve", "nowhere.npz"], 1, "does not exist"),

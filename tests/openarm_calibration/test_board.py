@@ -15,7 +15,8 @@ import pytest
 
 from openarm_calibration.board.board import Board, Charuco, CircleGrid, parse_board
 from openarm_calibration.board.board_files import pdf, png, write_board
-from openarm_calibration.board.detect import detect, guess_pose, refined
+from openarm_calibration.board.detect import detect, guess_pose
+from openarm_calibration.board.detect_circles import refined
 from openarm_calibration.handeye.problem import project
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
@@ -224,7 +225,10 @@ def test_drawn_marks_are_where_points_say() -> None:
         ({"rows": 10}, "is the same after half a turn"),
         ({"diameter": 0.03}, "touch"),
         ({"border": 0.001}, "cuts the outer circles"),
-        ({"kind": "chess"}, "no board 'chess'; boards: circles, charuco"),
+        (
+            {"kind": "chess"},
+            "no board 'chess'; boards: circles, symmetric_circles, chessboard, charuco, aprilgrid, marker",
+        ),
         ({"size": 3}, "unknown key"),
         ({"kind": "charuco", "dictionary": "DICT_X"}, "unknown dictionary; dictionaries: DICT_4X4_100"),
         ({"kind": "charuco", "diameter": 0.034}, "expected 0.4 to 0.9"),

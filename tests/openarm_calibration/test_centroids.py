@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from openarm_calibration.board.board import CircleGrid
-from openarm_calibration.board.detect import detect, refined
+from openarm_calibration.board.detect import detect
+from openarm_calibration.board.detect_circles import refined
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
 
