@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
-from pydantic import Field, model_validator
+import math
+from typing import Literal
 
-from openarm_common.camera.cameras import depth_cameras, table_camera
+from pydantic import Field, field_validator, model_validator
+
+from openarm_common.camera.cameras import depth_cameras, stereo_pairs, table_camera
 from openarm_common.config import Config, RunTimeField
 from openarm_common.scene.scene import load_scene
 from openarm_perception.detection.detector import Policy
@@ -17,6 +20,7 @@ from openarm_perception.detection.robot import CloudRobotConfig, RobotConfig
 from openarm_perception.detection.tags import TagConfig
 from openarm_perception.geometry.filters import FilterConfig
 from openarm_perception.geometry.watch import WatchConfig
+from openarm_perception.stereo.matching import StereoConfig
 
 
 class DetectNodeConfig(Config):
@@ -72,6 +76,44 @@ class DetectNodeConfig(Config):
             OpenArmError: SCENE_INVALID, from the scene.
         """
         return load_scene(self.scene).table.top_z if self.table_height is None else self.table_height
+
+
+class StereoNodeConfig(Config):
+    """Parameters of the node `stereo_depth`."""
+
+    camera: str = Field(
+        default_factory=lambda: next(iter(stereo_pairs()), ""), description="left camera of a pair of cameras.yaml"
+    )
+    left_topic: str = Field(default="/{camera}/color/image_raw", description="of the left camera; {camera} is its name")
+    left_info_topic: str = Field(default="/{camera}/color/camera_info", description="its CameraInfo")
+    right_topic: str = Field(default="/{right}/color/image_raw", description="of the right one; {right} is its name")
+    right_info_topic: str = Field(
+        default="/{right}/color/camera_info", description="its CameraInfo; P says the baseline"
+    )
+    rectified: bool = Field(default=False, description="whether the images are rectified as they come (image_rect)")
+    pose: tuple[float, ...] = Field(
+        default=(),
+        description="of the right camera in the left one's optical frame: x, y, z, m, and rotation vector, rad; for"
+        " drivers whose CameraInfo has no P of a pair; empty: by R and P",
+    )
+    depth_topic: str = Field(default="/{camera}/depth/image_raw", description="depth of the rectified left camera")
+    info_topic: str = Field(default="/{camera}/depth/camera_info", description="CameraInfo of the depth")
+    rectified_topic: str = Field(
+        default="/{camera}/color/image_rect", description="colour of the rectified left camera, aligned with the depth"
+    )
+    encoding: Literal["16UC1", "32FC1"] = Field(default="16UC1", description="whole millimetres, or metres")
+    stamp_gap: float = Field(default=0.001, ge=0.0, le=0.1, description="most that the stamps of a pair differ, s")
+    max_rate: float = Field(default=5.0, gt=0.0, le=60.0, description="most pairs a second of the stamps, Hz")
+    matcher: StereoConfig = StereoConfig()
+
+    @field_validator("pose")
+    @classmethod
+    def _six(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if len(value) not in (0, 6) or not all(math.isfinite(v) for v in value):
+            raise ValueError(
+                f"expected six finite numbers (x, y, z, m, rotation vector, rad) or none, got {list(value)}"
+            )
+        return value
 
 
 class CloudNodeConfig(Config):

@@ -19,6 +19,7 @@ setup(
         "console_scripts": [
             "cloud_node = openarm_perception.ros.cloud_node:main",
             "detect_node = openarm_perception.ros.detector_node:main",
+            "stereo_node = openarm_perception.ros.stereo_node:main",
         ]
     },
 )

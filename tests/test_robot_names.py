@@ -21,6 +21,9 @@ WORDS = {
     "openarm_bringup/commands/pick.py": {"right"},  # justification of a column
     "openarm_control/trajectory.py": {"right"},  # numpy.searchsorted
     "openarm_motion/timing/trajectory.py": {"right"},
+    "openarm_perception/ros/stereo_node.py": {"left", "right"},  # cameras of a pair
+    "openarm_perception/stereo/pairs.py": {"left", "right"},
+    "openarm_perception/stereo/rectification.py": {"left", "right"},
     "openarm_sim_bridge/openarm_ros2.py": {"right"},
     "openarm_sim_bridge/world/scenery.py": {"left", "right"},  # legs of a table
 }

@@ -125,6 +125,9 @@ class PublisherNode(BaseNode[PublisherConfig]):
         """
         if self.config.nominal:
             return (camera.T_parent_link, None), "nominal, as asked"
+        if camera.left:
+            (mount, optics), source = self._mount(self._cameras[camera.left], [])
+            return (mount @ camera.T_left_link, optics), f"with {camera.left}: {source}"
         seed = self.config.seed if camera.mount_error else None
         found, reasons = of_these_mounts(self._stores, camera.name, camera.parent, seed)
         if found is None:

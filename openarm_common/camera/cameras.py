@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -107,6 +108,8 @@ class CameraConfig(Config):
     depth: bool = Field(default=True, description="whether the camera has depth")
     mount_error: bool = Field(default=True, description="whether the mount seed moves the simulated mount")
     housing: Vector3 | None = Field(default=None, description="edges of the camera body along forward, left, up, m")
+    left: str = Field(default="", description="left camera of the pair whose right one this is, on the same body")
+    baseline: float = Field(default=0.0, ge=0.0, le=1.0, description="of that pair, m")
 
     @field_validator("forward", "image_right")
     @classmethod
@@ -135,6 +138,11 @@ class CameraConfig(Config):
     def T_parent_optical(self) -> Array:
         """Nominal pose of the optical frame in the parent, (4, 4)."""
         return self.T_parent_link @ T_LINK_OPTICAL
+
+    @property
+    def T_left_link(self) -> Array:
+        """The right camera of a pair in the link frame of the left one, (4, 4)."""
+        return se3.make(None, (0.0, -self.baseline, 0.0))
 
     @property
     def T_link_housing(self) -> Array:
@@ -171,7 +179,31 @@ def load_cameras(path: Path | None = None) -> dict[str, CameraConfig]:
     if len(by_name) != len(cameras):
         names = sorted(camera.name for camera in cameras)
         raise OpenArmError(Code.CONFIG_INVALID, f"{path}:cameras: names must be unique, got {', '.join(names)}")
+    for camera in cameras:
+        if fault := _pair_fault(camera, by_name):
+            raise OpenArmError(Code.CONFIG_INVALID, f"{path}:cameras.{camera.name}: {fault}")
     return by_name
+
+
+def _pair_fault(right: CameraConfig, cameras: Mapping[str, CameraConfig]) -> str:
+    """Return why a camera is not the right one of a rectified pair as it says; empty when it is, or says nothing."""
+    left = cameras.get(right.left)
+    if not right.left:
+        return "baseline without left; name the left camera of the pair" if right.baseline else ""
+    if left is None or left is right:
+        return f"left is {right.left!r}, expected another camera: {', '.join(n for n in cameras if n != right.name)}"
+    if (right.parent, right.width, right.height, right.fovy_deg) != (
+        left.parent,
+        left.width,
+        left.height,
+        left.fovy_deg,
+    ):
+        return f"parent, width, height and fovy_deg differ from those of {left.name!r}, expected the same"
+    place = left.T_parent_link @ right.T_left_link
+    if right.baseline == 0.0 or np.abs(place - right.T_parent_link).max() > 1e-4:
+        where = ", ".join(f"{v:.4f}" for v in place[:3, 3])
+        return f"expected it parallel to {left.name!r} and {right.baseline:g} m (baseline > 0) to its right, at {where}"
+    return ""
 
 
 def depth_cameras() -> dict[str, CameraConfig]:
@@ -180,8 +212,13 @@ def depth_cameras() -> dict[str, CameraConfig]:
 
 
 def uncertain_cameras() -> tuple[str, ...]:
-    """Return the names of the cameras whose mounts are to be calibrated."""
-    return tuple(name for name, camera in load_cameras().items() if camera.mount_error)
+    """Return the names of the cameras whose mounts are to be calibrated; of a pair, the left one's."""
+    return tuple(name for name, camera in load_cameras().items() if camera.mount_error and not camera.left)
+
+
+def stereo_pairs() -> dict[str, str]:
+    """Return the stereo pairs of this process's robot: the right camera by the left one."""
+    return {camera.left: name for name, camera in load_cameras().items() if camera.left}
 
 
 def hand_cameras() -> tuple[str, ...]:
@@ -207,7 +244,9 @@ def near_camera() -> str:
 @per_robot
 def spectator_camera() -> str:
     """Return the name of the camera for people: the first without depth, or else the one that looks at the table."""
-    return next((name for name, camera in load_cameras().items() if not camera.depth), table_camera())
+    paired = {name for pair in stereo_pairs().items() for name in pair}
+    others = (name for name, camera in load_cameras().items() if not camera.depth and name not in paired)
+    return next(others, table_camera())
 
 
 def detector_nodes() -> dict[str, str]:
@@ -217,15 +256,16 @@ def detector_nodes() -> dict[str, str]:
 
 
 def depth_camera(name: str) -> CameraConfig:
-    """Return a camera of this process's robot that has depth.
+    """Return a camera of this process's robot that has depth, its own or that of the pair whose left one it is.
 
     Raises:
         OpenArmError: CONFIG_INVALID, listing those that there are.
     """
-    cameras = depth_cameras()
-    if name not in cameras:
+    cameras = load_cameras()
+    valid = [*depth_cameras(), *stereo_pairs()]
+    if name not in valid:
         raise OpenArmError(
-            Code.CONFIG_INVALID, f"camera {name!r} is unknown or has no depth; cameras: {', '.join(cameras)}"
+            Code.CONFIG_INVALID, f"camera {name!r} is unknown or has no depth; cameras: {', '.join(valid)}"
         )
     return cameras[name]
 
@@ -235,15 +275,23 @@ def true_mount(camera: CameraConfig, mount_seed: int | None) -> Array:
 
     Args:
         camera: The camera with its nominal mount.
-        mount_seed: Seed of the error (up to 15 mm and 2°, drawn apart for each camera); None is no error.
+        mount_seed: Seed of the error (up to 15 mm and 2°, drawn apart for each camera or pair); None is no error.
 
     Returns:
         T_parent_link, (4, 4).
     """
     if mount_seed is None or not camera.mount_error:
         return camera.T_parent_link
-    rng = np.random.default_rng([mount_seed, zlib.crc32(camera.name.encode())])
+    error = _mount_error(camera.left or camera.name, mount_seed)
+    if camera.left:  # moves with the body that both are on
+        return camera.T_parent_link @ se3.inverse(camera.T_left_link) @ error @ camera.T_left_link
+    return camera.T_parent_link @ error
+
+
+def _mount_error(name: str, mount_seed: int) -> Array:
+    """Return the error of the mount of a camera in its link frame, (4, 4)."""
+    rng = np.random.default_rng([mount_seed, zlib.crc32(name.encode())])
     direction, axis = rng.normal(size=(2, 3))
     shift = direction / np.linalg.norm(direction) * rng.uniform(0.005, 0.015)
     turn = axis / np.linalg.norm(axis) * math.radians(rng.uniform(0.7, 2.0))
-    return camera.T_parent_link @ se3.make(se3.exp_so3(turn), shift)
+    return se3.make(se3.exp_so3(turn), shift)

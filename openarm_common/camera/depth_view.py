@@ -33,6 +33,13 @@ def unit_scale(depth: DepthImage) -> float:
     )
 
 
+def millimetres(z: Floats) -> NDArray[np.uint16]:
+    """Convert metres below 65 to whole millimetres, 0 for NaN; `z` is overwritten."""
+    np.multiply(z, np.float32(1000.0), out=z)
+    np.add(z, np.float32(0.5), out=z)
+    return np.nan_to_num(z, copy=False, nan=0.0).astype(np.uint16)
+
+
 def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> None:
     """Refuse an image that does not belong to the intrinsics.
 

@@ -231,13 +231,14 @@ def intrinsics_from_info(info: CameraInfo) -> Intrinsics:
     return intrinsics
 
 
-def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int) -> CameraInfo:
+def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int, baseline: float = 0.0) -> CameraInfo:
     """Make the CameraInfo of a camera without distortion.
 
     Args:
         intrinsics: Of the camera.
         frame_id: Optical frame.
         t_ns: Stamp.
+        baseline: From the left camera of a stereo pair to this one, its right one, m; 0 of others.
     """
     info = CameraInfo(header=header(frame_id, t_ns), height=intrinsics.height, width=intrinsics.width)
     info.distortion_model = "plumb_bob"
@@ -245,7 +246,7 @@ def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int) -> Ca
     info.d = [0.0] * 5
     info.k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     info.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-    info.p = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+    info.p = [fx, 0.0, cx, -fx * baseline, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
     return info
 
 

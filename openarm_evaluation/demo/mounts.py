@@ -12,7 +12,7 @@ from collections.abc import Callable
 from openarm_bringup.calibration.run import CalibrationListeners, CalibrationOptions, run_calibration
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.store.store import of_these_mounts, places
-from openarm_common.camera.cameras import load_cameras, true_mount
+from openarm_common.camera.cameras import load_cameras, true_mount, uncertain_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder
 
@@ -22,8 +22,8 @@ def uncalibrated(mount_seed: int) -> tuple[str, ...]:
     stores = places(default_folder(), mount_seed)
     return tuple(
         camera.name
-        for camera in load_cameras().values()
-        if camera.mount_error and of_these_mounts(stores, camera.name, camera.parent, mount_seed)[0] is None
+        for camera in (load_cameras()[name] for name in uncertain_cameras())
+        if of_these_mounts(stores, camera.name, camera.parent, mount_seed)[0] is None
     )
 
 
@@ -59,9 +59,7 @@ def errors(mount_seed: int, *, nominal: bool) -> dict[str, dict[str, float]]:
     """
     stores = places(default_folder(), mount_seed)
     out: dict[str, dict[str, float]] = {}
-    for camera in load_cameras().values():
-        if not camera.mount_error:
-            continue
+    for camera in (load_cameras()[name] for name in uncertain_cameras()):
         true = true_mount(camera, mount_seed)
         found, _ = of_these_mounts(stores, camera.name, camera.parent, mount_seed)
         used = camera.T_parent_link if nominal or found is None else found.record.T_parent_link

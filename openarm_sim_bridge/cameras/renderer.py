@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.camera.cameras import CameraConfig
+from openarm_common.camera.depth_view import millimetres
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Floats
 from openarm_sim_bridge.world.world import Snapshot
@@ -159,13 +160,6 @@ def planar_metres(raw: Floats, near: float, far: float) -> Floats:
     np.multiply(raw, np.float32(far - near), out=raw)
     np.add(raw, np.float32(near), out=raw)
     return np.divide(np.float32(far * near), raw, out=raw)
-
-
-def millimetres(z: Floats) -> NDArray[np.uint16]:
-    """Convert metres below 65 to whole millimetres, 0 for NaN; `z` is overwritten."""
-    np.multiply(z, np.float32(1000.0), out=z)
-    np.add(z, np.float32(0.5), out=z)
-    return np.nan_to_num(z, copy=False, nan=0.0).astype(np.uint16)
 
 
 class _Drawn:

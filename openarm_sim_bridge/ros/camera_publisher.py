@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Image
 
-from openarm_common.camera.cameras import CameraConfig
+from openarm_common.camera.cameras import CameraConfig, Intrinsics
 from openarm_common.ros.convert import ENCODINGS, array_to_image, image_to_array, info_from_intrinsics, ns_to_stamp
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_sim_bridge.cameras.cameras import SimulatedCameras
@@ -44,9 +44,13 @@ class _Stream:
             for message, topic in zip((Image, CameraInfo), topics, strict=True)
         )
         self.message = array_to_image(np.zeros(shape, dtype), encoding, camera.optical_frame, 0)
-        self.info_message = info_from_intrinsics(camera.intrinsics, camera.optical_frame, 0)
+        self._camera = camera
+        self.info_message = self.info_of(camera.intrinsics)
         self.pixels = image_to_array(self.message)
         self.wants_image = self.wants_info = False
+
+    def info_of(self, intrinsics: Intrinsics) -> CameraInfo:
+        return info_from_intrinsics(intrinsics, self._camera.optical_frame, 0, self._camera.baseline)
 
     def poll(self) -> bool:
         self.wants_image = self.image.get_subscription_count() > 0
@@ -130,8 +134,7 @@ class CameraPublisher:
         self.cameras.faults.set(faults)
         for name, streams in self._streams.items():
             for stream in streams:
-                frame = stream.info_message.header.frame_id
-                stream.info_message = info_from_intrinsics(self.cameras.intrinsics(name), frame, 0)
+                stream.info_message = stream.info_of(self.cameras.intrinsics(name))
 
     def publish_late(self) -> float:
         """Publish what was delayed until now; return in how many seconds the next is due."""

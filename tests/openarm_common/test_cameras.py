@@ -80,3 +80,40 @@ def test_two_cameras_of_one_name_are_refused(tmp_path) -> None:
     path.write_text(text)
     with pytest.raises(OpenArmError, match="unique"):
         load_cameras(path)
+
+
+PAIR = """
+cameras:
+  - {name: head_left, parent: world, position: [0, 0.03, 1], forward: [1, 0, -1], image_right: [0, -1, 0], depth: false}
+  - {name: head_right, parent: world, position: [0, -0.03, 1], forward: [1, 0, -1], image_right: [0, -1, 0],
+     depth: false, left: head_left, baseline: 0.06}
+"""
+
+
+def test_a_pair_moves_as_one_body_with_the_mount_seed(tmp_path) -> None:
+    path = tmp_path / "cameras.yaml"
+    path.write_text(PAIR)
+    left, right = load_cameras(path).values()
+    for seed in (None, 1, 2):
+        moved = se3.inverse(true_mount(left, seed)) @ true_mount(right, seed)
+        assert moved == pytest.approx(se3.make(None, (0.0, -0.06, 0.0)), abs=1e-12)
+    assert not np.allclose(true_mount(right, 1), right.T_parent_link)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("left: head_left", "left: hand", "left is 'hand', expected another camera: head_left"),
+        ("left: head_left", "left: head_right", "expected another camera"),
+        ("baseline: 0.06", "baseline: 0.07", "0.07 m .* to its right, at 0.0000, -0.0400, 1.0000"),
+        (", baseline: 0.06", "", "baseline > 0"),
+        ("left: head_left, ", "", "name the left camera"),
+        ("left: head_left", "left: head_left, width: 320", "width, height and fovy_deg differ"),
+    ],
+)
+def test_a_pair_that_is_not_side_by_side_is_refused(tmp_path, old: str, new: str, said: str) -> None:
+    path = tmp_path / "cameras.yaml"
+    assert old in PAIR
+    path.write_text(PAIR.replace(old, new))
+    with pytest.raises(OpenArmError, match=said):
+        load_cameras(path)

@@ -12,8 +12,9 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, load_cameras
+from openarm_common.camera.depth_view import millimetres
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.cameras.renderer import SnapshotRenderer, create_gl_context, millimetres, planar_metres
+from openarm_sim_bridge.cameras.renderer import SnapshotRenderer, create_gl_context, planar_metres
 from openarm_sim_bridge.world.world import Snapshot
 
 CAMERA = CameraConfig(
