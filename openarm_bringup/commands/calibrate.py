@@ -17,7 +17,7 @@ from openarm_bringup.calibration.source import (
     tables_in,
     with_solved,
 )
-from openarm_bringup.commands import calibrate_live
+from openarm_bringup.commands import calibrate_foreign, calibrate_live
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
@@ -31,6 +31,8 @@ calibrate.command(calibrate_live.auto)
 calibrate.command(calibrate_live.sample)
 calibrate.command(calibrate_live.table)
 calibrate.command(calibrate_live.dynamics)
+calibrate.command(calibrate_foreign.import_, name="import")
+calibrate.command(calibrate_foreign.export)
 
 
 @calibrate.command

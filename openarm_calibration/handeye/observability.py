@@ -88,12 +88,13 @@ def require_motion(problem: Problem) -> None:
         for board in np.unique(problem.board[mine]):
             chosen = mine & (problem.board == board)
             seen = motion(problem.A[chosen][np.unique(problem.pose[chosen], return_index=True)[1]])
-            fault = _fault(seen)
+            fault = motion_fault(seen)
             if fault:
                 raise OpenArmError(Code.DEGENERATE, fault)
 
 
-def _fault(seen: Motion) -> str:
+def motion_fault(seen: Motion) -> str:
+    """Return why a motion determines no mounts, and what to add; empty when it may."""
     degrees, millimetres = math.degrees(seen.rotation), seen.translation * 1e3
     if seen.poses < FEWEST:
         return (

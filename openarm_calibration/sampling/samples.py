@@ -3,7 +3,8 @@
 
 A session is one NPZ file without pickles: the head (camera, board, what carries what) as JSON, and of each sample the
 marks, the joint states with both stamps, and the image. It can be solved again without robot or ROS. Robot poses are
-recomputed from the joints by the description that reads it.
+recomputed from the joints by the description that reads it, or, for a robot that is not of this suite, by its own that
+the file keeps.
 """
 
 from __future__ import annotations
@@ -104,9 +105,10 @@ class SampleSet:
     Args:
         head: What the session is about.
         description: The robot; its forward kinematics turn joints into poses.
+        foreign: Whether the session file keeps the description, since no other reader has it.
     """
 
-    def __init__(self, head: SessionHead, description: RobotDescription) -> None:
+    def __init__(self, head: SessionHead, description: RobotDescription, *, foreign: bool = False) -> None:
         head = head.model_copy(update={"base": head.base or description.root})
         for what, link in (("parent", head.parent), ("carrier", head.carrier), ("base", head.base)):
             if link not in description.links:
@@ -114,7 +116,7 @@ class SampleSet:
                 raise OpenArmError(Code.CONFIG_INVALID, f"session:{what}: no link {link!r}; links: {links}")
         self.head = head
         self.board = parse_board(head.board, "session:board")
-        self._description = description
+        self._description, self._foreign = description, foreign
         self._samples: list[Sample] = []
         self._taken = 0
 
@@ -135,7 +137,7 @@ class SampleSet:
 
     def copy(self) -> SampleSet:
         """Return a set with the same samples."""
-        out = SampleSet(self.head, self._description)
+        out = SampleSet(self.head, self._description, foreign=self._foreign)
         for sample in self._samples:
             out.add(sample)
         return out
@@ -234,7 +236,8 @@ class SampleSet:
             }
             for sample in self._samples
         ]  # fmt: skip
-        return json.dumps({"format": 1, "head": self.head.model_dump(mode="json"), "samples": listed})
+        robot = {"urdf": self._description.urdf} if self._foreign else {}
+        return json.dumps({"format": 1, "head": self.head.model_dump(mode="json"), "samples": listed, **robot})
 
     def digest(self) -> str:
         """Return the hash of the session as it is now, as `save` returns it."""
@@ -294,6 +297,10 @@ _ARRAYS = ("ids", "pixels", "pose", "png")
 def load_session(path: Path, description: RobotDescription) -> tuple[SampleSet, str]:
     """Read a session file; returns the samples and the hash.
 
+    Args:
+        path: Of the session.
+        description: Of the robot, unless the session keeps one of its own.
+
     Raises:
         OpenArmError: CONFIG_INVALID, when it is missing, damaged, no session, or of another robot.
     """
@@ -303,7 +310,9 @@ def load_session(path: Path, description: RobotDescription) -> tuple[SampleSet, 
             text = bytes(data["head"]).decode()
             document = json.loads(text)
             head = validate(SessionHead, document["head"], f"{path}:head")
-            out = SampleSet(head, description)
+            if urdf := document.get("urdf"):
+                description = RobotDescription.from_urdf(str(urdf))
+            out = SampleSet(head, description, foreign=bool(urdf))
             for k, entry in enumerate(document["samples"]):
                 out.add(_sample(entry, {name: data[f"{name}_{k}"] for name in _ARRAYS}, out))
     except _DAMAGED as error:

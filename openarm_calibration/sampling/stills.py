@@ -8,7 +8,7 @@ show the same but for their noise. Stamps in ns, joint positions in rad.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_calibration.board.detect import detect
+from openarm_calibration.board.detection import BoardDetection
 from openarm_calibration.sampling.gate import GateConfig, Matched, match
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import Intrinsics
@@ -24,6 +25,8 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 
 State = tuple[int, Mapping[str, float]]
+#: Finds the board in a grey image (h, w), and returns the image to keep.
+Look = Callable[[NDArray[np.uint8]], tuple[BoardDetection, NDArray[np.uint8]]]
 
 #: Images with joints nearer to each other than this are of one standstill, rad.
 SAME_POSTURE = 0.01
@@ -104,10 +107,12 @@ class Picker:
     Args:
         samples: Grows.
         found: The recording's stretches; updated with what became of them.
+        look: Finds the board in an image, and returns the image to keep; by `detect`, as it is, when None.
     """
 
-    def __init__(self, samples: SampleSet, found: Sequence[Stretch]) -> None:
+    def __init__(self, samples: SampleSet, found: Sequence[Stretch], look: Look | None = None) -> None:
         self.samples = samples
+        self._look: Look = look or (lambda image: (detect(samples.board, image), image))
         self._open = {t: (stretch, matched) for stretch in found for t, matched in stretch.tries.items()}
 
     def wants(self, t_ns: int) -> bool:
@@ -126,11 +131,16 @@ class Picker:
         try:
             if optics != self.samples.head.optics:
                 raise OpenArmError(Code.BAD_IMAGE, f"the intrinsics changed: fx {optics.fx:.2f} here")
-            sample = self.samples.take(t_ns, matched, detect(self.samples.board, image), image)
+            sample = self.samples.take(t_ns, matched, *self._look(image))
         except OpenArmError as error:
             stretch.reason = stretch.reason or error.message
         else:
             stretch.sample, stretch.reason = sample.name, ""
+
+    def refuse(self, t_ns: int, error: OpenArmError) -> None:
+        """Say why the image of a stamp can't be looked at."""
+        stretch, _ = self._open[t_ns]
+        stretch.reason = stretch.reason or error.message
 
 
 def rows(found: Sequence[Stretch]) -> list[dict[str, Any]]:

@@ -138,7 +138,7 @@ def _renamed(joints: dict[str, float]) -> dict[str, float]:
         (lambda d, a: d["samples"][1].update(joints=_renamed(d["samples"][1]["joints"])), "another robot: it lacks"),
         (lambda d, a: d["head"].update(parent="tool0"), "no link 'tool0'; links:"),
         (lambda d, a: d["head"].update(camera="../wrist"), "head:camera"),
-        (lambda d, a: d["head"].update(board={"kind": "dots"}), "boards: circles, charuco"),
+        (lambda d, a: d["head"].update(board={"kind": "dots"}), "boards: circles, symmetric_circles"),
         (lambda d, a: d["head"].update(board={"kind": "circles", "rows": 7}), "marks that its board does not have"),
         (lambda d, a: a["pixels_1"].__setitem__((0, 0), math.nan), "all finite"),
         (lambda d, a: a["ids_1"].__setitem__(0, -1), "marks that its board does not have"),

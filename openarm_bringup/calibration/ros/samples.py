@@ -58,8 +58,8 @@ def samples_of(
         small = _small(bag, camera)
     optics = next(iter(small.optics.values()))
     configured = load_cameras()
-    ours = RobotDescription.load().base
-    base = ours if ours in small.robot.links else small.robot.root
+    own = RobotDescription.load()
+    base = own.base if own.base in small.robot.links else small.robot.root
     parent = _parent(small, camera, base, configured)
     simulated = camera not in configured or configured[camera].mount_error
     seed = mount_seed if mount_seed is not None else _seed(bag)
@@ -67,15 +67,18 @@ def samples_of(
         camera, parent, small.robot, optics, board, carrier,
         base=base, mount_seed=seed if simulated else None,
     )  # fmt: skip
-    samples = SampleSet(head, small.robot)
+    # a session file of a robot that this suite does not have keeps its description
+    link = head.parent if head.setup == "in_hand" else head.carrier
+    ours = link in own.links and all(joint.name in own.joints for joint in small.robot.chain(link))
+    samples = SampleSet(head, small.robot, foreign=not ours)
     images = f"/{camera}{_IMAGES}"
     # The first bytes of a message are its stamp; the pixels are read in a second pass, where they are needed.
     with contents(bag):
-        stamps = [_stamp(record.data) for record in bag.records([images])]
+        stamps = [stamp_of(record.data) for record in bag.records([images])]
     found = stretches(stamps, small.states, samples.joint_names, small.robot, GateConfig())
     picker = Picker(samples, found)
     for record in bag.records([images]):
-        t_ns = _stamp(record.data)
+        t_ns = stamp_of(record.data)
         if picker.wants(t_ns):
             picker.offer(t_ns, grey(message_of(bag, record)), small.optics.get(t_ns, optics))
     return samples, found
@@ -159,7 +162,7 @@ def _seed(bag: Bag) -> int | None:
     return seed if isinstance(seed, int) and seed >= 0 else None
 
 
-def _stamp(data: bytes) -> int:
+def stamp_of(data: bytes) -> int:
     """Stamp of a serialized message that begins with a header, ns."""
     order = "little" if data[1] & 1 else "big"
     seconds, nanoseconds = (int.from_bytes(data[k : k + 4], order, signed=k == 4) for k in (4, 8))

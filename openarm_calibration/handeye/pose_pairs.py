@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hand-eye from pairs of poses, where no pixels are left: of the robot, and of the board in the camera.
+
+A pair says `T_camera_board = X⁻¹ B Z` as a view does (see `problem`). What is off is taken as independent from pair to
+pair, with one variance of translations and one of rotations; both are estimated with the mounts by their redundancies
+(Förstner's variance components). That is less than pixels give: how sure each direction of a board's pose is, a pair
+does not say. m, rad.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from openarm_calibration.handeye.closed_form import METHODS, REFINED, closed_form
+from openarm_calibration.handeye.observability import FEWEST, motion, motion_fault
+from openarm_calibration.handeye.problem import Setup, inverses, moved, skews
+from openarm_calibration.handeye.refine import invert_scaled, mount_error
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array, Mask
+
+_ROUNDS = 30
+#: Least deviations that are estimated: numbers in a file have as many digits, m and rad.
+_LEAST = (1e-7, 1e-7)
+#: With fewer pairs none is left out; and never more than this share.
+_FEWEST_TO_REJECT, _MOST_REJECTED = 7, 0.25
+_FALSE_ALARM = 1e-3
+#: By how much a closed form must predict left-out pairs better to be taken instead.
+_BETTER = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class PosePairs:
+    """Pairs of poses of one camera and board.
+
+    Args:
+        setup: in_hand or to_hand.
+        A: (n, 4, 4) T_base_gripper.
+        C: (n, 4, 4) T_camera_board.
+        names: (n,).
+    """
+
+    setup: Setup
+    A: Array
+    C: Array
+    names: tuple[str, ...]
+
+    @property
+    def B(self) -> Array:
+        """(n, 4, 4) from the board's to the camera's carrier."""
+        return inverses(self.A) if self.setup == "in_hand" else self.A
+
+    def subset(self, keep: Mask) -> PosePairs:
+        """Return some of the pairs."""
+        names = tuple(name for name, kept in zip(self.names, keep, strict=True) if kept)
+        return PosePairs(self.setup, self.A[keep], self.C[keep], names)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """How a method predicts pairs that it did not see: rms at the board, m, and rad."""
+
+    translation: float
+    rotation: float
+
+
+@dataclass(frozen=True, eq=False)
+class PairSolution:
+    """Mounts from pairs.
+
+    Args:
+        X: (4, 4) of the camera.
+        Z: (4, 4) of the board.
+        covariance: (12, 12) of X, then Z, six numbers each as in `problem`.
+        noise: Estimated deviations of a pair by axis, m and rad.
+        used: (n,) pairs that it rests on.
+        left_out: Prediction of left-out pairs by method; what a method fails with is its message.
+        method: Whose X and Z these are: the refinement unless a closed form predicts better.
+        distance: (n,) squared distance of each pair over its expectation.
+    """
+
+    X: Array
+    Z: Array
+    covariance: Array
+    noise: tuple[float, float]
+    used: Mask
+    left_out: dict[str, LeftOut | str]
+    method: str
+    distance: Array
+
+    @property
+    def sigma(self) -> tuple[float, float]:
+        """Predicted error of the camera's mount: standard deviation of position (m) and rotation (rad) as vectors."""
+        return math.sqrt(np.trace(self.covariance[:3, :3])), math.sqrt(np.trace(self.covariance[3:6, 3:6]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    X: Array
+    Z: Array
+    covariance: Array
+    noise: tuple[float, float]
+
+
+def residuals(pairs: PosePairs, X: Array, Z: Array) -> Array:
+    """Return (n, 6): how far each board is from where X and Z predict it, m at the board and rad."""
+    T = se3.inverse(X) @ pairs.B @ Z
+    turned = np.swapaxes(T[:, :3, :3], 1, 2) @ pairs.C[:, :3, :3]
+    return np.hstack([pairs.C[:, :3, 3] - T[:, :3, 3], Rotation.from_matrix(turned).as_rotvec()])
+
+
+def solve_pairs(pairs: PosePairs) -> PairSolution:
+    """Solve for the mounts, leave out pairs that the others contradict, and compare with closed forms.
+
+    Raises:
+        OpenArmError: DEGENERATE, when the poses do not determine the mounts, with the cause and what to add;
+            INVALID_ARGUMENT, for numbers that are not finite.
+    """
+    if not (np.isfinite(pairs.A).all() and np.isfinite(pairs.C).all()):
+        raise OpenArmError(Code.INVALID_ARGUMENT, "a pose has numbers that are not finite; remove that sample")
+    if len(pairs.A) < FEWEST or motion_fault(motion(pairs.A)):
+        fault = motion_fault(motion(pairs.A)) if len(pairs.A) else "too few poses: none"
+        raise OpenArmError(Code.DEGENERATE, fault)
+    used = np.ones(len(pairs.A), dtype=bool)
+    fit = _fit(pairs, used)
+    while used.sum() > max(_FEWEST_TO_REJECT, (1.0 - _MOST_REJECTED) * len(used)):
+        worst, distance = -1, 0.0
+        for k in np.flatnonzero(used):  # each against the answer and the noise of the others
+            rest = used.copy()
+            rest[k] = False
+            other = _fit(pairs, rest, fit)
+            away = float(np.sum((residuals(pairs.subset(~rest & used), other.X, other.Z) / _sigmas(other)) ** 2)) / 6.0
+            if away > distance:
+                worst, distance = int(k), away
+        freedom = 6 * (int(used.sum()) - 1) - 12
+        if distance <= stats.f.ppf(1.0 - _FALSE_ALARM / used.sum(), 6, freedom):
+            break
+        used[worst] = False
+        fit = _fit(pairs, used, fit)
+    if fault := motion_fault(motion(pairs.A[used])):
+        raise OpenArmError(Code.DEGENERATE, fault)
+    distances = np.mean((residuals(pairs, fit.X, fit.Z) / _sigmas(fit)) ** 2, axis=1)
+    inside = pairs.subset(used)
+    left_out = _left_out(inside, fit)
+    method = _best(left_out, fit)
+    X, Z, covariance = fit.X, fit.Z, fit.covariance
+    if method != REFINED:
+        mounts = closed_form(method, pairs.setup, inside.A, inside.C)
+        X, Z = mounts.X, mounts.Z
+        offset, angle = mount_error(X, fit.X)  # its own error is not known; the distance is the better part of it
+        covariance = covariance.copy()
+        covariance[:6, :6] += np.diag([offset**2 / 3.0] * 3 + [angle**2 / 3.0] * 3)
+    return PairSolution(X, Z, covariance, fit.noise, used, left_out, method, distances)
+
+
+def _sigmas(fit: _Fit) -> Array:
+    return np.array([fit.noise[0]] * 3 + [fit.noise[1]] * 3)
+
+
+def _fit(pairs: PosePairs, used: Mask, start: _Fit | None = None) -> _Fit:
+    """Return the mounts of least squares and the deviations that fit them."""
+    part = pairs.subset(used)
+    if start is None:
+        mounts = closed_form("PARK", part.setup, part.A, part.C)
+        X, Z, noise = mounts.X, mounts.Z, (1e-3, 1e-3)
+    else:
+        X, Z, noise = start.X, start.Z, start.noise
+    information = np.eye(12)
+    for _ in range(_ROUNDS):
+        error = residuals(part, X, Z)
+        J = _derivative(part, X, Z)
+        weight = np.array([noise[0] ** -2.0] * 3 + [noise[1] ** -2.0] * 3)
+        information = np.einsum("nia,i,nib->ab", J, weight, J)
+        covariance = invert_scaled(information)
+        step = -covariance @ np.einsum("nia,i,ni->a", J, weight, error)
+        X, Z = moved(X, step[:6]), moved(Z, step[6:])
+        error = residuals(part, X, Z)
+        spent = np.einsum("nia,ab,nib->i", J, covariance, J) * weight
+        before = noise
+        noise = tuple(
+            max(math.sqrt(float(np.sum(error[:, s] ** 2)) / max(3.0 * len(error) - float(spent[s].sum()), 1.0)), least)
+            for s, least in zip((slice(0, 3), slice(3, 6)), _LEAST, strict=True)
+        )
+        settled = all(abs(a - b) <= 1e-3 * b for a, b in zip(noise, before, strict=True))
+        if settled and float(np.sqrt(step @ information @ step)) < 1e-3:
+            break
+    return _Fit(X, Z, invert_scaled(information), (noise[0], noise[1]))
+
+
+def _derivative(pairs: PosePairs, X: Array, Z: Array) -> Array:
+    """Return (n, 6, 12) how the residuals change with the six numbers of X and those of Z, for small residuals."""
+    T = se3.inverse(X) @ pairs.B @ Z
+    out = np.zeros((len(pairs.A), 6, 12))
+    out[:, :3, :3] = X[:3, :3].T
+    out[:, :3, 3:6] = -skews(T[:, :3, 3])
+    out[:, 3:, 3:6] = np.swapaxes(pairs.C[:, :3, :3], 1, 2)
+    out[:, :3, 6:9] = -X[:3, :3].T @ pairs.B[:, :3, :3]
+    out[:, 3:, 9:] = -np.eye(3)
+    return out
+
+
+def _left_out(pairs: PosePairs, fit: _Fit) -> dict[str, LeftOut | str]:
+    """Return how each method predicts each pair from the others."""
+    every = ~np.eye(len(pairs.A), dtype=bool)
+    kept = [keep for keep in every if keep.sum() >= FEWEST and not motion_fault(motion(pairs.A[keep]))]
+    return {method: _predicted(pairs, method, fit, kept) for method in (REFINED, *METHODS)}
+
+
+def _predicted(pairs: PosePairs, method: str, fit: _Fit, kept: list[Mask]) -> LeftOut | str:
+    """Return how a method predicts the pair that each of some masks (n,) leaves out."""
+    errors: list[Array] = []
+    for keep in kept:
+        part = pairs.subset(keep)
+        try:
+            solved = _fit(pairs, keep, fit) if method == REFINED else closed_form(method, part.setup, part.A, part.C)
+            errors.append(residuals(pairs.subset(~keep), solved.X, solved.Z)[0])
+        except (OpenArmError, ValueError) as error:  # a closed form may return a reflection
+            return error.message if isinstance(error, OpenArmError) else "no rotation for some of the pairs"
+    if not errors:
+        return "too few pairs to leave one out"
+    mean = np.mean(np.square(errors), axis=0)
+    return LeftOut(math.sqrt(float(mean[:3].sum())), math.sqrt(float(mean[3:].sum())))
+
+
+def _best(left_out: dict[str, LeftOut | str], fit: _Fit) -> str:
+    """Return the refinement, or the closed form that predicts left-out pairs clearly better."""
+
+    def score(method: str) -> float:
+        found = left_out[method]
+        if isinstance(found, str):
+            return math.inf
+        return math.hypot(found.translation / fit.noise[0], found.rotation / fit.noise[1])
+
+    best = min(left_out, key=score)
+    return best if score(best) < _BETTER * score(REFINED) else REFINED
