@@ -41,8 +41,8 @@ Frames = Literal["T_base_tip", "T_tip_base"]
 _LOOSE = 0.02
 #: A second convention that explains the poses to within this factor leaves the guess open.
 _AMBIGUOUS = 1.5
-#: Positions of a robot are within this, m; the others are millimetres.
-_REACH = 20.0
+#: Largest positions of a robot's tip: above these metres the numbers are millimetres, below these millimetres metres.
+_REACH, _CRAMPED = 20.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,8 @@ def candidates(
         )
     chosen = (rotation,) if rotation else forms
     far = float(np.abs(_read(chosen[0], rows)[0]).max())
-    units: tuple[Unit, ...] = (unit,) if unit else (("mm",) if far > _REACH else ("m", "mm"))
+    likely: tuple[Unit, ...] = ("mm",) if far > _REACH else ("m",) if far < _CRAMPED else ("m", "mm")
+    units: tuple[Unit, ...] = (unit,) if unit else likely
     ways: tuple[Frames, ...] = (frames,) if frames else ("T_base_tip", "T_tip_base")
     made = tuple(Convention(*one) for one in itertools.product(chosen, units, ways))
     fitting = tuple(one for one in made if one.poses(rows) is not None)

@@ -115,6 +115,16 @@ def test_rotations_that_do_not_tell_their_order_are_said_to_be_ambiguous() -> No
     assert is_ambiguous(tried)
 
 
+def test_a_tip_that_moves_within_millimetres_is_of_a_file_in_metres() -> None:
+    """Read as millimetres the poses of a real arm hardly move, which noise of a degree does not exclude."""
+    known = files.truth("in_hand", 13, 3e-3, np.radians(1.0), 4)
+    rows = files.numbers(known.A, "rpy")
+    tried = guess(rows, known.C, "in_hand", candidates(rows, None, None, None))
+    assert tried[0].convention == Convention("rpy", "m", "T_base_tip")
+    assert {one.convention.unit for one in tried} == {"m"}
+    assert not is_ambiguous(tried)
+
+
 @pytest.mark.parametrize("rows", [np.zeros((5, 5)), np.full((5, 7), 3.0), np.ones((5, 16))])
 def test_numbers_that_are_no_poses_are_refused(rows) -> None:
     with pytest.raises(OpenArmError) as caught:
