@@ -143,6 +143,22 @@ class NearLookConfig(Config):
     timeout: float = Field(default=2.0, gt=0.0, le=20.0, description="wait for its frames, wall clock, s")
 
 
+class CloudConfig(Config):
+    """How grasps are found on the cloud of an object of any shape."""
+
+    voxel: float = Field(default=0.0025, ge=0.001, le=0.01, description="edge of a voxel of the fused surface, m")
+    cone_deg: float = Field(
+        default=25.0, gt=0.0, le=45.0, description="friction cone: normals at both contacts against the closing axis, deg"
+    )
+    margin: float = Field(
+        default=0.004, ge=0.0, le=0.02, description="least room between an open finger and the object, m"
+    )
+    table_clearance: float = Field(default=0.003, ge=0.0, le=0.02, description="hand over the table, m")
+    pairs: int = Field(default=200, ge=10, le=2000, description="pairs of opposite contacts that are tried")
+    poses: int = Field(default=2500, ge=100, le=100_000, description="poses of the hand that are tried")
+    best: int = Field(default=60, ge=1, le=500, description="candidates that are offered to the planner")
+
+
 class ConfirmConfig(Config):
     """When a plan that a person has confirmed is still that plan."""
 
@@ -288,7 +304,13 @@ class GraspConfig(Config):
     velocity_scale: float = Field(
         default=0.0, ge=0.0, le=1.0, description="of the motion limits; 0 = the planner's default"
     )
+    sampler: str = Field(
+        default="auto",
+        description="what finds grasps: boxes (across the faces of what is measured as a box or cylinder), cloud (on the"
+        " cloud of any shape), auto (boxes where they fit, else cloud), or package.module:Class of another one",
+    )
     approach: ApproachConfig = ApproachConfig()
+    cloud: CloudConfig = CloudConfig()
     hand: HandConfig = HandConfig()
     timing: TimingConfig = TimingConfig()
     held: HeldConfig = HeldConfig()

@@ -65,6 +65,10 @@ class GraspCandidate:
         tilt: Lean of the approach from straight down, rad.
         score: Higher is tried first; the sum of `parts`.
         parts: What the score is made of.
+        apertures: Least and greatest aperture that is expected when the hand has closed on what is no box, m; None: it
+            is `width`.
+        contact_area: Of the smaller of both contact patches, m2; 0: not known.
+        held: What is grasped, as boxes, base frame; empty: it is the box that was detected.
     """
 
     id: str
@@ -75,6 +79,9 @@ class GraspCandidate:
     tilt: float
     score: float
     parts: Mapping[str, float]
+    apertures: tuple[float, float] | None = None
+    contact_area: float = 0.0
+    held: tuple[Box, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Antipodal grasps on a fused surface, ranked.
+
+Two contacts hold an object by friction when the line between them lies in both friction cones (Nguyen, "Constructing
+force-closure grasps", IJRR 1988). Pairs of such contacts are found by marching from the surface through the object;
+around each, hand poses turn about the closing axis and reach to several depths, and stay when the shape of the hand
+has room (ten Pas and Platt, "Using geometry to detect grasp poses in 3D point clouds", ISRR 2015). From coarse to fine:
+each pair first with an upright hand, then the best of them in all ways. The score weighs how much touches, how well
+it faces the pads, how far the weight is from the pads, room, tilt, and how much of it was seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import acos, cos, radians
+
+import numpy as np
+
+from openarm_common.octree.distance_field import DistanceField
+from openarm_common.types import Array
+from openarm_grasp.config import ApproachConfig, CloudConfig
+from openarm_grasp.sampling import antipodal_kernels as kernels
+from openarm_grasp.sampling.hand_shape import HandShape
+from openarm_grasp.sampling.surface import Surface
+from openarm_grasp.sampling.voxel_kernels import SHADOW, boundary
+
+#: Boundary voxels that pairs start from, a multiple of the pairs that are kept.
+_STARTS = 4
+#: Pairs are one when their middles are in one cell of this edge, voxels, and their axes in one sector, rad.
+_SAME_MIDDLE, _SAME_AXIS = 3.0, radians(12.0)
+#: Sine of the steepest closing axis.
+_LEAN = 0.5
+#: Contact along the pad, 0 its upper end: upright hands first, then all.
+_FIRST_DEPTHS, _DEPTHS = (0.35, 0.8), (0.15, 0.4, 0.65, 0.9)
+#: Good poses of one pair, and of all.
+_PER_PAIR, _ENOUGH = 6, 300
+#: Candidates differ by a displacement of the TCP, m, or a turn.
+_APART, _TURNED = 0.008, radians(12.0)
+#: A pad that touches with this share of its area holds as well as one that touches with all.
+_TOUCH = 0.35
+#: Weights of the score; lengths m, angles rad.
+_WEIGHTS = {"contact": 1.5, "align": 10.0, "lever": -25.0, "aside": -10.0, "tilt": -0.8, "level": -0.8, "wide": -1.5,
+            "room": 0.3, "certainty": 1.5, "unseen": -2.0}  # fmt: skip
+#: The weight may be this far from the pads before it counts, m.
+_LEVER = 0.005
+#: A width this near to the widest begins to count, m; alignments count from here.
+_WIDE, _ALIGNED = 0.020, 0.9
+#: What a pair without an upright hand lost against one with it.
+_NOT_UPRIGHT = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Antipodal:
+    """One grasp on a surface.
+
+    Attributes:
+        T_base_tcp: (4, 4).
+        width: Extent between the pads, m.
+        apertures: Least and greatest aperture that the closed hand may have, m.
+        contact_area: Of the smaller patch, m2.
+        tilt: Of the approach from straight down, rad.
+        score: The sum of `parts`.
+        parts: What it is made of.
+    """
+
+    T_base_tcp: Array
+    width: float
+    apertures: tuple[float, float]
+    contact_area: float
+    tilt: float
+    score: float
+    parts: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """How many poses were tried, and why the others were refused."""
+
+    pairs: int
+    poses: int
+    good: int
+    why: Mapping[str, int]
+
+
+_WHY = ("tried", "object", "table", "hand in something", "too wide, or something between", "approach", "contact",
+        "alignment")  # fmt: skip
+
+
+class Search:
+    """Looks for grasps of one hand on one surface.
+
+    Args:
+        surface: Where.
+        shape: Of the hand.
+        config: Of the search.
+        approach: Distance and tilts.
+        field: Distances to obstacles; read where the surface knows nothing.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        shape: HandShape,
+        config: CloudConfig,
+        approach: ApproachConfig,
+        field: DistanceField | None = None,
+    ) -> None:
+        self._surface, self._shape, self._config, self._approach = surface, shape, config, approach
+        self._field = field
+        step = surface.step
+        self._hand = np.ascontiguousarray(shape.points / step)
+        self._pads, self._tips = shape.pads / step, shape.tips / step
+        self._widest = 2.0 * (shape.opening - config.margin) / step
+        self._least_cos = cos(radians(config.cone_deg))
+        self._why = np.zeros(len(_WHY), np.int64)
+        self._pairs = np.empty((0, 8))
+        self._good = 0
+
+    @property
+    def tried(self) -> Tried:
+        """What the search has done so far."""
+        why = dict(zip(_WHY[1:], map(int, self._why[1:]), strict=True))
+        return Tried(len(self._pairs), int(self._why[0]), self._good, why)
+
+    def best(self) -> tuple[Antipodal, ...]:
+        """Find grasps, best first; the same for the same surface."""
+        self._pairs = self._find_pairs()
+        if not len(self._pairs):
+            return ()
+        bound = self._bound(self._pairs)
+        order = np.argsort(-bound, kind="stable")
+        first = _hypotheses(order, (0.0,), _FIRST_DEPTHS, (1.0,))
+        upright = self._search(first, per_pair=1, enough=len(order))
+        expected = bound - _WEIGHTS["contact"] - _NOT_UPRIGHT
+        if len(upright):
+            expected[upright[:, kernels.PAIR].astype(int)] = self._scores(upright)[0]
+        turns = [sign * radians(t) for t in self._approach.tilts_deg for sign in ((1.0, -1.0) if t else (1.0,))]
+        rest = _hypotheses(np.arange(len(expected)), turns, _DEPTHS, (1.0, -1.0))
+        hoped = expected[rest[:, 0].astype(int)] + _WEIGHTS["tilt"] * np.abs(rest[:, 1])
+        rest = rest[np.argsort(-hoped, kind="stable")]
+        return self._ranked(np.concatenate([upright, self._search(rest, per_pair=_PER_PAIR, enough=_ENOUGH)]))
+
+    def exhaustive(self) -> tuple[Antipodal, ...]:
+        """Find grasps without the coarse stage: every pair in all ways; what `best` is compared with."""
+        self._config = self._config.model_copy(update={"poses": 10**9})
+        self._pairs = self._find_pairs()
+        turns = [sign * radians(t) for t in self._approach.tilts_deg for sign in ((1.0, -1.0) if t else (1.0,))]
+        every = _hypotheses(np.arange(len(self._pairs)), turns, _DEPTHS, (1.0, -1.0))
+        return self._ranked(self._search(every, per_pair=len(every) + 1, enough=len(every)))
+
+    def near(self, poses: list[tuple[Array, float]]) -> tuple[Antipodal, ...]:
+        """Find grasps next to hand poses, best first.
+
+        Args:
+            poses: T_base_tcp (4, 4) and width, m.
+        """
+        rows: list[list[float]] = []
+        tries: list[tuple[float, float, float, float]] = []
+        for T, width in poses:
+            pad = self._shape.pads[int(np.abs(self._shape.fingers - 0.5 * width).argmin())]
+            middle = self._surface.voxel(T[:3, 3] + 0.5 * (pad[2] + pad[3]) * T[:3, 2])
+            down = np.array([0.0, 0.0, -1.0])
+            down -= (down @ T[:3, 1]) * T[:3, 1]
+            turn = acos(float(np.clip(down @ T[:3, 2] / max(float(np.linalg.norm(down)), 1e-9), -1.0, 1.0)))
+            turn *= 1.0 if float(np.cross(down, T[:3, 2]) @ T[:3, 1]) >= 0.0 else -1.0
+            tries += [(float(len(rows)), turn, depth, 1.0) for depth in (0.5, 0.35, 0.65, 0.2, 0.8)]
+            rows.append([*middle, *T[:3, 1], width / self._surface.step, 1.0])
+        self._pairs = np.array(rows, dtype=np.float64).reshape(-1, 8)
+        return self._ranked(self._search(np.array(tries).reshape(-1, 4), per_pair=2, enough=_ENOUGH))
+
+    def _find_pairs(self) -> Array:
+        """Pairs of contacts (p, 8), one of each kind."""
+        surface, most = self._surface, self._config.pairs
+        edge = boundary(surface.cells)
+        edge = edge[surface.normals[tuple(edge.T)].any(axis=1)]
+        # shuffled by a generator of its own, so that the same surface gives the same starts, spread over all of it
+        starts = edge[np.random.default_rng(0).permutation(len(edge))[: _STARTS * most]]
+        out = np.empty((2 * len(starts), 8))
+        n = kernels.pairs(surface.cells, surface.normals, starts, _LEAN, self._widest, self._least_cos, out)
+        pairs = out[:n]
+        pairs[(pairs[:, 3] < 0.0) | ((pairs[:, 3] == 0.0) & (pairs[:, 4] < 0.0)), 3:6] *= -1.0
+        sector = np.floor(np.arctan2(pairs[:, 4], pairs[:, 3]) / _SAME_AXIS)
+        keys = np.column_stack([np.floor(pairs[:, :3] / _SAME_MIDDLE), sector, np.abs(pairs[:, 5]) > 1e-9])
+        pairs = pairs[np.argsort(-pairs[:, 7], kind="stable")]
+        keys = keys[np.argsort(-out[:n, 7], kind="stable")] if n else keys
+        _, first = np.unique(keys, axis=0, return_index=True)
+        pairs = pairs[np.sort(first)]
+        return np.ascontiguousarray(pairs[np.argsort(-self._bound(pairs), kind="stable")][:most])
+
+    def _bound(self, pairs: Array) -> Array:
+        """About the best score (p,) of a hand at each pair."""
+        step, centre = self._surface.step, self._surface.voxel(self._surface.centroid)
+        off = (centre - pairs[:, :3])[:, :2]
+        level = np.maximum(np.linalg.norm(pairs[:, 3:5], axis=1), 1e-6)
+        lever = np.abs(off[:, 0] * pairs[:, 4] - off[:, 1] * pairs[:, 3]) / level * step
+        aside = np.abs((off * pairs[:, 3:5]).sum(axis=1)) / level * step
+        w = _WEIGHTS
+        return np.asarray(
+            w["contact"]
+            + w["align"] * (pairs[:, 7] - _ALIGNED)
+            + w["lever"] * np.maximum(lever - _LEVER, 0.0)
+            + w["aside"] * aside
+            + w["level"] * np.abs(pairs[:, 5])
+            + w["wide"] * self._wide(pairs[:, 6])
+        )
+
+    def _wide(self, widths: Array) -> Array:
+        """How far widths (n,), voxels, are in the last part of what the hand takes, 0 to 1."""
+        return np.maximum(1.0 - (self._widest - widths) * self._surface.step / _WIDE, 0.0)
+
+    def _search(self, hypotheses: Array, *, per_pair: int, enough: int) -> Array:
+        surface, step = self._surface, self._surface.step
+        found = np.zeros((enough, kernels.COLUMNS))
+        if not len(hypotheses):
+            return found[:0]
+        count = kernels.search(
+            surface.cells, surface.obstacles, surface.normals, self._pairs, hypotheses, self._hand, self._pads,
+            self._tips, self._shape.opening / step, (self._shape.fingers[1] - self._shape.fingers[0]) / step,
+            self._config.table_clearance / step, self._approach.pregrasp_distance / step,
+            surface.voxel(surface.centroid), self._widest, self._least_cos, per_pair, enough, self._config.poses,
+            found, self._why,
+        )  # fmt: skip
+        self._good += count
+        return found[:count]
+
+    def _scores(self, found: Array) -> tuple[Array, dict[str, Array]]:
+        """Scores (n,) of rows, and their parts."""
+        step, k, w = self._surface.step, kernels, _WEIGHTS
+        parts = {
+            "contact": w["contact"] * np.minimum(found[:, k.TOUCH] / _TOUCH, 1.0),
+            "align": w["align"] * (found[:, k.ALIGN] - _ALIGNED),
+            "lever": w["lever"] * np.maximum(found[:, k.LEVER] * step - _LEVER, 0.0),
+            "aside": w["aside"] * found[:, k.ASIDE] * step,
+            "tilt": w["tilt"] * found[:, k.TILT],
+            "level": w["level"] * np.abs(found[:, 9]),
+            "wide": w["wide"] * self._wide(found[:, k.WIDTH]),
+            "room": w["room"] * (found[:, k.ROOM] - 1.0),
+            "certainty": w["certainty"] * (found[:, k.SURE] - 1.0),
+            "unseen": w["unseen"] * found[:, k.BLIND],
+        }
+        return np.asarray(sum(parts.values())), parts
+
+    def _ranked(self, found: Array) -> tuple[Antipodal, ...]:
+        """Best first, no two alike, none whose hand is in a voxel that was seen or near an obstacle of the map."""
+        if not len(found):
+            return ()
+        found = found[np.argsort(-self._scores(found)[0], kind="stable")]
+        step, shape, surface = self._surface.step, self._shape, self._surface
+        apart = kernels.distinct(found, _APART / step, cos(_TURNED), len(found))
+        found = found[apart]
+        scores, parts = self._scores(found)
+        seen = surface.middles(np.argwhere((surface.cells > 0) & (surface.cells < SHADOW)))
+        low, high = shape.points.min(axis=0), shape.points.max(axis=0)
+        best: list[Antipodal] = []
+        for row in range(len(found)):
+            T = np.eye(4)
+            T[:3] = found[row, :12].reshape(3, 4)
+            T[:3, 3] = surface.low + T[:3, 3] * step
+            R, p = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+            if kernels.inside(seen, R, p, shape.planes, shape.starts, low, high) or not self._clear_of_map(T):
+                continue
+            best.append(self._grasp(found[row], T, float(scores[row]), {n: float(v[row]) for n, v in parts.items()}))
+            if len(best) == self._config.best:
+                break
+        return tuple(best)
+
+    def _grasp(self, row: Array, T: Array, score: float, parts: dict[str, float]) -> Antipodal:
+        step, k = self._surface.step, kernels
+        width = float(row[k.WIDTH]) * step
+        pad = self._shape.pads[int(np.abs(self._shape.fingers - 0.5 * width).argmin())]
+        area = float(row[k.TOUCH] * (pad[1] - pad[0]) * (pad[3] - pad[2]))
+        # a voxel each way, and more at a side that was not seen; an object that turns in the hand gets narrower
+        unsure = (1.0 - float(row[k.SURE])) * 2.0 * step
+        least = max(float(row[k.NARROW]) * step - 2.0 * step, 0.0)
+        most = min(width + 2.0 * step + unsure, 2.0 * self._shape.opening)
+        return Antipodal(T, width, (least, most), area, float(row[k.TILT]), score, parts)
+
+    def _clear_of_map(self, T: Array) -> bool:
+        """Whether the hand keeps out of the cells of the map beyond the voxels of the surface."""
+        if self._field is None:
+            return True
+        points = self._shape.points @ T[:3, :3].T + T[:3, 3]
+        local = self._surface.voxel(points)[:, :2]
+        beyond = ((local < 0.0) | (local >= self._surface.cells.shape[:2])).any(axis=1)
+        return not bool((self._field.at(points[beyond]) < 0.87 * self._field.lattice.resolution).any())
+
+
+def _hypotheses(
+    pairs: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
+    turns: tuple[float, ...] | list[float],
+    depths: tuple[float, ...],
+    signs: tuple[float, ...],
+) -> Array:
+    """Every combination (n, 4) of pair, turn, depth and sign, pair by pair."""
+    grids = np.meshgrid(pairs, turns, depths, signs, indexing="ij")
+    return np.stack([grid.ravel() for grid in grids], axis=1).astype(np.float64)

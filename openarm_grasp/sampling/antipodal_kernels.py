@@ -1,0 +1,455 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels of the search for antipodal grasps.
+
+Coordinates are in voxels: voxel (i, j, k) reaches from (i, j, k) to (i + 1, j + 1, k + 1), the table is the plane z = 0.
+A hand has its approach along z and opens along y.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from openarm_common.types import Array, Bytes, Floats, Ints
+from openarm_grasp.sampling.voxel_kernels import FILLED, FREE, OTHER, SEEN
+
+#: Lattice of rays between the pads: across, and along the fingers.
+_ACROSS, _ALONG = 8, 9
+#: Pads give: what is this near to the first contact touches, voxels.
+_SOFT = 1.3
+#: The far side is left when so many steps of half a voxel are not of the object.
+_GONE = 4
+
+#: A side that was not seen may reach so much farther out, voxels.
+_UNSEEN = 2.0
+#: Rays that must touch each pad.
+_LEAST_TOUCH = 3.0
+
+#: Columns of `found`: pose (12), width, narrowest, touching share, alignment, lever, off the middle, tilt, certainty,
+#: in shadow, room, pair.
+COLUMNS = 23
+WIDTH, NARROW, TOUCH, ALIGN, LEVER, ASIDE, TILT, SURE, BLIND, ROOM, PAIR = range(12, 23)
+
+
+@njit(cache=True, nogil=True)
+def _cell(cells: Bytes, x: float, y: float, z: float) -> int:
+    i, j, k = math.floor(x), math.floor(y), math.floor(z)
+    if i < 0 or j < 0 or k < 0 or i >= cells.shape[0] or j >= cells.shape[1] or k >= cells.shape[2]:
+        return FREE
+    return cells[i, j, k]
+
+
+@njit(cache=True, nogil=True)
+def pairs(
+    cells: Bytes, normals: Floats, starts: Ints, lean: float, widest: float, least_cos: float, out: Array
+) -> int:
+    """Find opposite contacts: from each start through the object, level and along the normal.
+
+    Args:
+        cells: (nx, ny, nz).
+        normals: (nx, ny, nz, 3).
+        starts: (n, 3) voxels at the boundary of the target.
+        lean: Closing axes that rise by more (sine) are left out.
+        widest: Voxels.
+        least_cos: Both normals are at most this far (cosine) from the closing axis: the friction cone.
+        out: (2 n, 8) rows: middle (3), closing axis (3), width, alignment.
+
+    Returns:
+        How many.
+    """
+    count = 0
+    for s in range(starts.shape[0]):
+        i, j, k = starts[s, 0], starts[s, 1], starts[s, 2]
+        nx, ny, nz = normals[i, j, k, 0], normals[i, j, k, 1], normals[i, j, k, 2]
+        level = math.hypot(nx, ny)
+        if level < 0.3:
+            continue
+        for way in range(2):
+            if way == 0:
+                dx, dy, dz = -nx / level, -ny / level, 0.0
+            elif 0.15 < abs(nz) < lean:
+                dx, dy, dz = -nx, -ny, -nz
+            else:
+                break
+            near = -(nx * dx + ny * dy + nz * dz)
+            if near < least_cos:
+                continue
+            px, py, pz = i + 0.5, j + 0.5, k + 0.5
+            at, last, gone = 0.0, -1.0, 0
+            while at < widest + 3.0:
+                what = _cell(cells, px + dx * at, py + dy * at, pz + dz * at)
+                if what == SEEN or what == FILLED:
+                    last, gone = at, 0
+                else:
+                    gone += 1
+                    if gone > _GONE:
+                        break
+                at += 0.5
+            if last < 0.5 or last > widest:
+                continue
+            qx, qy, qz = math.floor(px + dx * last), math.floor(py + dy * last), math.floor(pz + dz * last)
+            far = normals[qx, qy, qz, 0] * dx + normals[qx, qy, qz, 1] * dy + normals[qx, qy, qz, 2] * dz
+            if far < least_cos:
+                continue
+            out[count, 0], out[count, 1], out[count, 2] = px + dx * last / 2, py + dy * last / 2, pz + dz * last / 2
+            out[count, 3], out[count, 4], out[count, 5] = dx, dy, dz
+            out[count, 6], out[count, 7] = last, min(near, far)
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _hits(obstacles: Bytes, hand: Array, T: Array, px: float, py: float, pz: float, floor: float, stride: int) -> int:
+    """Return -1 when a hand (n, 3) with rotation of T at p meets an obstacle or comes below `floor`; else its points
+    in the target's shadow."""
+    blind = 0
+    nx, ny, nz = obstacles.shape
+    for n in range(0, hand.shape[0], stride):
+        z = T[2, 0] * hand[n, 0] + T[2, 1] * hand[n, 1] + T[2, 2] * hand[n, 2] + pz
+        if z < floor:
+            return -1
+        if z >= nz:
+            continue
+        x = T[0, 0] * hand[n, 0] + T[0, 1] * hand[n, 1] + T[0, 2] * hand[n, 2] + px
+        y = T[1, 0] * hand[n, 0] + T[1, 1] * hand[n, 1] + T[1, 2] * hand[n, 2] + py
+        i, j, k = math.floor(x), math.floor(y), math.floor(z)
+        if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny:
+            continue
+        what = obstacles[i, j, k]
+        if what == 2:
+            blind += 1
+        elif what != 0:
+            return -1
+    return blind
+
+
+@njit(cache=True, nogil=True)
+def _between(cells: Bytes, T: Array, pad: Array, opening: float, first: Array, last: Array) -> bool:
+    """March between the open pads: where each ray first and last meets the target; NaN where it does not.
+
+    Returns:
+        False, when something else is between the pads.
+    """
+    for a in range(_ACROSS):
+        x = pad[0] + (pad[1] - pad[0]) * a / (_ACROSS - 1)
+        for b in range(_ALONG):
+            z = pad[2] + (pad[3] - pad[2]) * b / (_ALONG - 1)
+            bx = T[0, 0] * x + T[0, 2] * z + T[0, 3]
+            by = T[1, 0] * x + T[1, 2] * z + T[1, 3]
+            bz = T[2, 0] * x + T[2, 2] * z + T[2, 3]
+            first[a, b], last[a, b] = math.nan, math.nan
+            if bz >= cells.shape[2] + abs(T[2, 1]) * opening:
+                continue
+            y = -opening
+            while y <= opening:
+                what = _cell(cells, bx + T[0, 1] * y, by + T[1, 1] * y, bz + T[2, 1] * y)
+                if what == OTHER:
+                    return False
+                if what == SEEN or what == FILLED:
+                    if math.isnan(first[a, b]):
+                        first[a, b] = y
+                    last[a, b] = y
+                y += 0.5
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _sure(cells: Bytes, obstacles: Bytes, x: float, y: float, z: float, dx: float, dy: float, dz: float) -> bool:
+    """Whether a contact was seen, or what is two voxels before it (d: outwards) is known to be free."""
+    if _cell(cells, x, y, z) == SEEN:
+        return True
+    return _cell(cells, x + 2.0 * dx, y + 2.0 * dy, z + 2.0 * dz) == FREE
+
+
+@njit(cache=True, nogil=True)
+def _touch(
+    cells: Bytes, obstacles: Bytes, normals: Floats, T: Array, pad: Array, first: Array, last: Array, out: Array
+) -> bool:
+    """Measure the contact patches of both pads: width, narrowest, share that touches, alignment, certainty.
+
+    Also writes the mean normals of both patches to out[5:11].
+    """
+    low, high = math.inf, -math.inf
+    for a in range(_ACROSS):
+        for b in range(_ALONG):
+            if not math.isnan(first[a, b]):
+                low, high = min(low, first[a, b]), max(high, last[a, b])
+    if high < low:
+        return False
+    narrow = high - low
+    count = np.zeros(2)
+    sure = np.zeros(2)
+    mean = np.zeros((2, 3))
+    for a in range(_ACROSS):
+        x = pad[0] + (pad[1] - pad[0]) * a / (_ACROSS - 1)
+        for b in range(_ALONG):
+            if math.isnan(first[a, b]):
+                continue
+            z = pad[2] + (pad[3] - pad[2]) * b / (_ALONG - 1)
+            touching = 0
+            for side in range(2):
+                y = first[a, b] if side == 0 else last[a, b]
+                if (y - low if side == 0 else high - y) > _SOFT:
+                    continue
+                touching += 1
+                cx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+                cy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+                cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+                i, j, k = math.floor(cx), math.floor(cy), math.floor(cz)
+                n = normals[i, j, k]
+                count[side] += 1.0
+                mean[side, 0] += n[0]
+                mean[side, 1] += n[1]
+                mean[side, 2] += n[2]
+                out_y = -1.0 if side == 0 else 1.0
+                if _sure(cells, obstacles, cx, cy, cz, T[0, 1] * out_y, T[1, 1] * out_y, T[2, 1] * out_y):
+                    sure[side] += 1.0
+            if touching == 2:
+                narrow = min(narrow, last[a, b] - first[a, b])
+    if min(count[0], count[1]) < _LEAST_TOUCH:
+        return False
+    align = 1.0
+    for side in range(2):
+        size = math.sqrt(mean[side, 0] ** 2 + mean[side, 1] ** 2 + mean[side, 2] ** 2)
+        if size < 1e-6:
+            return False
+        along = (mean[side, 0] * T[0, 1] + mean[side, 1] * T[1, 1] + mean[side, 2] * T[2, 1]) / count[side]
+        align = min(align, -along if side == 0 else along)
+        for axis in range(3):
+            out[5 + 3 * side + axis] = mean[side, axis] / size
+    # what is measured fills the voxel that it is in: half a voxel too much at each side
+    out[0], out[1], out[2] = max(high - low - 1.0, 0.5), max(narrow - 1.0, 0.0), min(count[0], count[1]) / (_ACROSS * _ALONG)
+    out[3], out[4] = align, min(sure[0] / count[0], sure[1] / count[1])
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _frame(d: Array, angle: float, T: Array) -> bool:
+    """Write a rotation whose y is d and whose z is turned about d by an angle from straight down."""
+    level = d[0] * d[0] + d[1] * d[1]
+    if level < 0.36:
+        return False
+    size = math.sqrt(level)
+    ax, ay, az = d[2] * d[0] / size, d[2] * d[1] / size, -size
+    bx, by, bz = d[1] * az - d[2] * ay, d[2] * ax - d[0] * az, d[0] * ay - d[1] * ax
+    c, s = math.cos(angle), math.sin(angle)
+    zx, zy, zz = c * ax + s * bx, c * ay + s * by, c * az + s * bz
+    T[0, 2], T[1, 2], T[2, 2] = zx, zy, zz
+    T[0, 1], T[1, 1], T[2, 1] = d[0], d[1], d[2]
+    T[0, 0], T[1, 0], T[2, 0] = d[1] * zz - d[2] * zy, d[2] * zx - d[0] * zz, d[0] * zy - d[1] * zx
+    return True
+
+
+@njit(cache=True, nogil=True)
+def search(
+    cells: Bytes, obstacles: Bytes, normals: Floats, found_pairs: Array, hypotheses: Array, hand: Array, pads: Array,
+    tips: Array, opening: float, finger_step: float, clearance: float, back: float, centre: Array, widest: float,
+    least_cos: float, per_pair: int, enough: int, most: int, found: Array, why: Ints,
+) -> int:  # fmt: skip
+    """Try hand poses in their order until enough are good.
+
+    Args:
+        cells: (nx, ny, nz).
+        obstacles: (nx, ny, nz) of the hand.
+        normals: (nx, ny, nz, 3).
+        found_pairs: (p, 8) of `pairs`.
+        hypotheses: (h, 4) pair, turn about the closing axis (rad), contact along the pad (0 upper end, 1 tip), sign of
+            the closing axis.
+        hand: (n, 3) points of the open hand.
+        pads: (m, 4) by finger.
+        tips: (m, c, 3) by finger.
+        opening: Finger of the open hand.
+        finger_step: Between rows of `pads` and `tips`.
+        clearance: Of the hand over the table.
+        back: Length of the straight approach.
+        centre: (3,) of mass.
+        widest: Voxels.
+        least_cos: Of the friction cone.
+        per_pair: Good poses of one pair.
+        enough: Good poses.
+        most: Poses that are tried.
+        found: (enough, COLUMNS), filled.
+        why: (8,) counts: tried, not enough of the object, table, hand hits, wide or something between, approach,
+            contact, alignment.
+
+    Returns:
+        How many are good.
+    """
+    count = 0
+    T = np.eye(4)
+    d, contact = np.empty(3), np.empty(11)
+    first, last = np.empty((_ACROSS, _ALONG)), np.empty((_ACROSS, _ALONG))
+    good = np.zeros(found_pairs.shape[0], np.int64)
+    for h in range(hypotheses.shape[0]):
+        if count == enough or why[0] == most:
+            break
+        p = int(hypotheses[h, 0])
+        if good[p] >= per_pair:
+            continue
+        why[0] += 1
+        pair, sign = found_pairs[p], hypotheses[h, 3]
+        d[0], d[1], d[2] = sign * pair[3], sign * pair[4], sign * pair[5]
+        ok = True
+        middle_x, middle_y, middle_z = pair[0], pair[1], pair[2]
+        for turn in range(2):  # the second time with the closing axis of the contact patches
+            row = min(int(round(0.5 * pair[6] / finger_step)), pads.shape[0] - 1)
+            pad = pads[row]
+            if not _frame(d, sign * hypotheses[h, 1], T):
+                ok = False
+                break
+            at = pad[2] + (pad[3] - pad[2]) * hypotheses[h, 2]
+            T[0, 3], T[1, 3], T[2, 3] = middle_x - at * T[0, 2], middle_y - at * T[1, 2], middle_z - at * T[2, 2]
+            if turn == 0:
+                lowest = math.inf
+                for n in range(tips.shape[1]):
+                    z = T[2, 0] * tips[row, n, 0] + T[2, 1] * tips[row, n, 1] + T[2, 2] * tips[row, n, 2]
+                    lowest = min(lowest, z)
+                # lower than the table allows: the hand goes back along its approach, as far as the pad is long
+                short = clearance - lowest - T[2, 3]
+                if short > 0.0:
+                    away = short / -T[2, 2]
+                    if away > 0.5 * (pad[3] - pad[2]):
+                        why[2] += 1
+                        ok = False
+                        break
+                    middle_x -= away * T[0, 2]
+                    middle_y -= away * T[1, 2]
+                    middle_z -= away * T[2, 2]
+                    T[0, 3] -= away * T[0, 2]
+                    T[1, 3] -= away * T[1, 2]
+                    T[2, 3] -= away * T[2, 2]
+                if _hits(obstacles, hand, T, T[0, 3], T[1, 3], T[2, 3], clearance, 7) < 0:
+                    why[3] += 1
+                    ok = False
+                    break
+            if not _between(cells, T, pad, opening, first, last):
+                why[4] += 1
+                ok = False
+                break
+            if not _touch(cells, obstacles, normals, T, pad, first, last, contact):
+                why[6] += 1
+                ok = False
+                break
+            if contact[0] + _UNSEEN * (1.0 - contact[4]) > widest:
+                why[4] += 1
+                ok = False
+                break
+            # in the middle of what the pads meet
+            low, high = math.inf, -math.inf
+            for a in range(_ACROSS):
+                for b in range(_ALONG):
+                    if not math.isnan(first[a, b]):
+                        low, high = min(low, first[a, b]), max(high, last[a, b])
+            off = 0.5 * (low + high)
+            for axis in range(3):
+                T[axis, 3] += off * T[axis, 1]
+            middle_x += off * T[0, 1]
+            middle_y += off * T[1, 1]
+            middle_z += off * T[2, 1]
+            if turn == 1:
+                break
+            nx, ny, nz = contact[8] - contact[5], contact[9] - contact[6], contact[10] - contact[7]
+            if pair[5] == 0.0:
+                nz = 0.0
+            size = math.sqrt(nx * nx + ny * ny + nz * nz)
+            turned = (nx * d[0] + ny * d[1] + nz * d[2]) / max(size, 1e-9)
+            if size < 1e-6 or turned < 0.8 or turned > 0.9995:
+                break
+            d[0], d[1], d[2] = nx / size, ny / size, nz / size
+        if not ok:
+            continue
+        if contact[3] < least_cos:
+            why[7] += 1
+            continue
+        blind = _hits(obstacles, hand, T, T[0, 3], T[1, 3], T[2, 3], clearance, 1)
+        if blind < 0:
+            why[3] += 1
+            continue
+        steps = int(math.ceil(back / 4.0))
+        for n in range(1, steps + 1):
+            far = min(4.0 * n, back)
+            bx, by, bz = T[0, 3] - far * T[0, 2], T[1, 3] - far * T[1, 2], T[2, 3] - far * T[2, 2]
+            if _hits(obstacles, hand, T, bx, by, bz, clearance, 2) < 0:
+                ok = False
+                break
+        if not ok:
+            why[5] += 1
+            continue
+        room = 0.0
+        for side in range(2):
+            for far in range(2):
+                by_y = (3.0 if far else 1.5) * (1.0 if side else -1.0)
+                free = _hits(
+                    obstacles, hand, T, T[0, 3] + by_y * T[0, 1], T[1, 3] + by_y * T[1, 1], T[2, 3] + by_y * T[2, 1],
+                    0.5 * clearance, 2,
+                )  # fmt: skip
+                if free < 0:
+                    break
+                room += 0.25
+        out = found[count]
+        for r in range(3):
+            for c in range(4):
+                out[4 * r + c] = T[r, c]
+        z = 0.5 * (pad[2] + pad[3])
+        rx, ry = centre[0] - T[0, 3] - z * T[0, 2], centre[1] - T[1, 3] - z * T[1, 2]
+        level = max(math.hypot(T[0, 1], T[1, 1]), 1e-6)
+        out[WIDTH], out[NARROW], out[TOUCH], out[ALIGN] = contact[0], contact[1], contact[2], contact[3]
+        out[LEVER] = abs(rx * T[1, 1] - ry * T[0, 1]) / level
+        out[ASIDE] = abs(rx * T[0, 1] + ry * T[1, 1]) / level
+        out[TILT] = math.acos(min(1.0, -T[2, 2]))
+        out[SURE], out[BLIND], out[ROOM], out[PAIR] = contact[4], blind / hand.shape[0], room, p
+        good[p] += 1
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def inside(points: Array, R: Array, p: Array, planes: Array, starts: Ints, low: Array, high: Array) -> bool:
+    """Whether any of points (n, 3) is in the hand at (R, p); low, high: (3,) bounds of the hand in its frame."""
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0] - p[0], points[n, 1] - p[1], points[n, 2] - p[2]
+        c = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+        if c < low[2] or c > high[2]:
+            continue
+        a = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
+        b = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
+        if a < low[0] or a > high[0] or b < low[1] or b > high[1]:
+            continue
+        for piece in range(starts.shape[0] - 1):
+            out = False
+            for e in range(starts[piece], starts[piece + 1]):
+                if planes[e, 0] * a + planes[e, 1] * b + planes[e, 2] * c + planes[e, 3] > 0.0:
+                    out = True
+                    break
+            if not out:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def distinct(found: Array, apart: float, least_cos: float, best: int) -> Ints:
+    """Return the indices of rows (sorted, best first) that no better one resembles: TCP within `apart`, turned less."""
+    kept = np.empty(best, np.int64)
+    many = 0
+    for n in range(found.shape[0]):
+        new = True
+        for m in range(many):
+            a, b = found[n], found[kept[m]]
+            dx, dy, dz = a[3] - b[3], a[7] - b[7], a[11] - b[11]
+            if dx * dx + dy * dy + dz * dz > apart * apart:
+                continue
+            trace = 0.0
+            for r in range(3):
+                for c in range(3):
+                    trace += a[4 * r + c] * b[4 * r + c]
+            if trace > 1.0 + 2.0 * least_cos:
+                new = False
+                break
+        if new:
+            kept[many] = n
+            many += 1
+            if many == best:
+                break
+    return kept[:many].copy()

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cloud of voxels as a few upright boxes that together hold it: what is in the hand, for the planner. Base frame, m."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from openarm_common import se3
+from openarm_common.types import Array
+from openarm_grasp.planning.candidates import Box
+
+#: A further box must save this share of the volume of the one about everything.
+_SAVED = 0.06
+#: Cuts of a box are tried at so many places along each axis.
+_CUTS = 8
+#: Turns of the boxes that are tried, up to a quarter.
+_TURNS = 18
+
+
+class _Cut(NamedTuple):
+    """Where a part is best cut, and the volume that it saves."""
+
+    saved: float
+    axis: int
+    at: float
+
+
+def slabs(label: str, points: Array, step: float, *, gap: float = 0.0, most: int = 8) -> tuple[Box, ...]:
+    """Put upright boxes around points, cut where that saves most volume.
+
+    Args:
+        label: Of the object; it names the boxes.
+        points: (n, 3) middles of voxels.
+        step: Edge of a voxel.
+        gap: The boxes end this far above the lowest voxel, so that what stands on a table is not in collision with it.
+        most: Boxes.
+    """
+    R = se3.rot_z(_yaw(points[:, :2]))
+    parts = [points @ R]
+    least = _SAVED * _volume(parts[0], step)
+    cuts = [_cut(parts[0], step)]
+    while len(parts) < most:
+        n = int(np.argmax([cut.saved for cut in cuts]))
+        cut = cuts[n]
+        if cut.saved <= least:
+            break
+        below = parts[n][:, cut.axis] < cut.at
+        parts[n : n + 1] = [parts[n][below], parts[n][~below]]
+        cuts[n : n + 1] = [_cut(part, step) for part in parts[n : n + 2]]
+    floor = float(points[:, 2].min()) - 0.5 * step + gap
+    boxes: list[Box] = []
+    for n, part in enumerate(parts):
+        low, high = part.min(axis=0) - 0.5 * step, part.max(axis=0) + 0.5 * step
+        low[2] = min(max(low[2], floor), high[2] - step)
+        boxes.append(Box(f"target/{label}_{n}", se3.make(R, R @ (0.5 * (low + high))), high - low))
+    return tuple(boxes)
+
+
+def _yaw(xy: Array) -> float:
+    """Turn of the smallest rectangle about points (n, 2), rad."""
+    turns = np.arange(_TURNS) * 0.5 * np.pi / _TURNS
+    sizes = [np.ptp(xy @ se3.rot_z(float(turn))[:2, :2], axis=0) for turn in turns]
+    return float(turns[int(np.argmin([float(size.prod()) for size in sizes]))])
+
+
+def _volume(points: Array, step: float) -> float:
+    return float(np.prod(np.ptp(points, axis=0) + step))
+
+
+def _cut(points: Array, step: float) -> _Cut:
+    """The best cut of a part; one that saves nothing where it is too small."""
+    whole, best = _volume(points, step), _Cut(0.0, 0, 0.0)
+    for axis in range(3):
+        low, high = float(points[:, axis].min()), float(points[:, axis].max())
+        for at in np.linspace(low, high, _CUTS + 2)[1:-1]:
+            below = points[:, axis] < at
+            if below.any() and not below.all():
+                saved = whole - _volume(points[below], step) - _volume(points[~below], step)
+                best = max(best, _Cut(saved, axis, float(at)))
+    return best
