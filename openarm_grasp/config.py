@@ -148,7 +148,10 @@ class CloudConfig(Config):
 
     voxel: float = Field(default=0.0025, ge=0.001, le=0.01, description="edge of a voxel of the fused surface, m")
     cone_deg: float = Field(
-        default=25.0, gt=0.0, le=45.0, description="friction cone: normals at both contacts against the closing axis, deg"
+        default=25.0,
+        gt=0.0,
+        le=45.0,
+        description="friction cone: normals at both contacts against the closing axis, deg",
     )
     margin: float = Field(
         default=0.004, ge=0.0, le=0.02, description="least room between an open finger and the object, m"
@@ -306,8 +309,8 @@ class GraspConfig(Config):
     )
     sampler: str = Field(
         default="auto",
-        description="what finds grasps: boxes (across the faces of what is measured as a box or cylinder), cloud (on the"
-        " cloud of any shape), auto (boxes where they fit, else cloud), or package.module:Class of another one",
+        description="what finds grasps: boxes (across the faces of what is measured as a box or cylinder), cloud (on"
+        " the cloud of any shape), auto (boxes where they fit, else cloud), or package.module:Class of another one",
     )
     approach: ApproachConfig = ApproachConfig()
     cloud: CloudConfig = CloudConfig()

@@ -73,16 +73,31 @@ class CameraVerdict(Verdict):
     """What a camera says of the object and its place."""
 
 
-def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> GripperVerdict:
+def judge_grip(
+    e: Evidence,
+    config: HeldConfig,
+    *,
+    was_held: bool = False,
+    apertures: tuple[float, float] | None = None,
+    closed: float | None = None,
+) -> GripperVerdict:
     """Whether the hand holds the object: GRASP_MISSED, when it is empty or moves; HAND_COLLISION; GRASP_LOST.
 
     Args:
         e: What the gripper says.
         config: Thresholds.
         was_held: The object was held before: an empty hand has lost it.
+        apertures: Least and greatest gap around what is no box, m; None: the object is `e.expected` wide, within
+            `width_tolerance`.
+        closed: Gap after the hand had closed, m: one that has changed by more than `slip` since says that the object
+            has turned or slipped. None: not judged.
     """
     empty = Code.GRASP_LOST if was_held else Code.GRASP_MISSED
     gap, width = f"gap {e.gap * 1e3:.1f} mm", f"the object's {e.expected * 1e3:.1f} mm"
+    least, most = e.expected - config.width_tolerance, e.expected + config.width_tolerance
+    if apertures is not None:
+        least, most = apertures
+        width = f"the {least * 1e3:.1f} to {most * 1e3:.1f} mm that its surface has there"
     if e.tcp_error > config.max_tcp_error:
         off, limit = e.tcp_error * 1e3, config.max_tcp_error * 1e3
         return GripperVerdict(
@@ -90,10 +105,15 @@ def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> Gr
         )
     if e.gap <= config.closed_below:
         return GripperVerdict(empty, f"{gap}: the fingers are closed on nothing")
-    if e.gap > e.expected + config.width_tolerance:
+    if e.gap > most:
         return GripperVerdict(Code.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it")
-    if e.gap < e.expected - config.width_tolerance:
+    if e.gap < least:
         return GripperVerdict(empty, f"{gap} is narrower than {width}: something else is between the fingers")
+    if closed is not None and abs(e.gap - closed) > config.slip:
+        was, limit = f"{closed * 1e3:.1f} mm when the hand had closed", f"at most {config.slip * 1e3:.0f} mm"
+        return GripperVerdict(
+            Code.GRASP_LOST, f"{gap}, {was}: the object has turned or slipped in the hand, expected a change of {limit}"
+        )
     if abs(e.speed) >= config.max_speed:
         return GripperVerdict(Code.GRASP_MISSED, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest")
     if config.use_effort and abs(e.effort) <= config.min_effort:

@@ -67,7 +67,7 @@ class GraspCandidate:
         parts: What the score is made of.
         apertures: Least and greatest aperture that is expected when the hand has closed on what is no box, m; None: it
             is `width`.
-        contact_area: Of the smaller of both contact patches, m2; 0: not known.
+        patch_area: Of the smaller of both contact patches, m2; 0: not known.
         held: What is grasped, as boxes, base frame; empty: it is the box that was detected.
     """
 
@@ -80,7 +80,7 @@ class GraspCandidate:
     score: float
     parts: Mapping[str, float]
     apertures: tuple[float, float] | None = None
-    contact_area: float = 0.0
+    patch_area: float = 0.0
     held: tuple[Box, ...] = ()
 
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.wanted import fits
+from openarm_grasp.config import HeldConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.drift import DriftWatch
-from openarm_grasp.evidence.verdicts import GripperVerdict, Verdict
+from openarm_grasp.evidence.verdicts import Evidence, GripperVerdict, Verdict, judge_grip
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
@@ -34,12 +35,19 @@ class Grasp:
         sighting: The object and its neighbours before the grasp.
         candidate: How the hand takes hold.
         places: Ways to put the object down.
+        closed: Aperture after the hand had closed on what is no box, m; None: it was not, or it is a box.
     """
 
     arm: str
     sighting: Sighting
     candidate: GraspCandidate
     places: tuple[PlaceTarget, ...]
+    closed: float | None = None
+
+    def judge(self, evidence: Evidence, config: HeldConfig, *, was_held: bool = False) -> GripperVerdict:
+        """What the gripper says: of a box by its width, of any other shape by the interval and by `closed`."""
+        apertures = self.candidate.apertures
+        return judge_grip(evidence, config, was_held=was_held, apertures=apertures, closed=self.closed)
 
 
 @dataclass(frozen=True)

@@ -41,11 +41,13 @@ _APART, _TURNED = 0.008, radians(12.0)
 _TOUCH = 0.35
 #: Weights of the score; lengths m, angles rad.
 _WEIGHTS = {"contact": 1.5, "align": 10.0, "lever": -25.0, "aside": -10.0, "tilt": -0.8, "level": -0.8, "wide": -1.5,
-            "room": 0.3, "certainty": 1.5, "unseen": -2.0}  # fmt: skip
+            "room": 0.3, "certainty": 1.0, "balance": -1.5, "unseen": -2.0}  # fmt: skip
 #: The weight may be this far from the pads before it counts, m.
 _LEVER = 0.005
 #: A width this near to the widest begins to count, m; alignments count from here.
 _WIDE, _ALIGNED = 0.020, 0.9
+#: And a width may be larger by this share: what is steep is measured too narrow.
+_SLACK = 0.05
 #: What a pair without an upright hand lost against one with it.
 _NOT_UPRIGHT = 1.0
 
@@ -58,7 +60,7 @@ class Antipodal:
         T_base_tcp: (4, 4).
         width: Extent between the pads, m.
         apertures: Least and greatest aperture that the closed hand may have, m.
-        contact_area: Of the smaller patch, m2.
+        patch_area: Of the smaller patch, m2.
         tilt: Of the approach from straight down, rad.
         score: The sum of `parts`.
         parts: What it is made of.
@@ -67,7 +69,7 @@ class Antipodal:
     T_base_tcp: Array
     width: float
     apertures: tuple[float, float]
-    contact_area: float
+    patch_area: float
     tilt: float
     score: float
     parts: Mapping[str, float]
@@ -120,7 +122,7 @@ class Search:
     @property
     def tried(self) -> Tried:
         """What the search has done so far."""
-        why = dict(zip(_WHY[1:], map(int, self._why[1:]), strict=True))
+        why = {str(name): int(count) for name, count in zip(_WHY[1:], self._why[1:], strict=True)}
         return Tried(len(self._pairs), int(self._why[0]), self._good, why)
 
     def best(self) -> tuple[Antipodal, ...]:
@@ -237,7 +239,8 @@ class Search:
             "wide": w["wide"] * self._wide(found[:, k.WIDTH]),
             "room": w["room"] * (found[:, k.ROOM] - 1.0),
             "certainty": w["certainty"] * (found[:, k.SURE] - 1.0),
-            "unseen": w["unseen"] * found[:, k.BLIND],
+            "balance": w["balance"] * np.arctan(found[:, k.SLOPE]),
+            "unseen": w["unseen"] * (found[:, k.BLIND] + found[:, k.UNSEEN] * step / _WIDE),
         }
         return np.asarray(sum(parts.values())), parts
 
@@ -271,9 +274,9 @@ class Search:
         pad = self._shape.pads[int(np.abs(self._shape.fingers - 0.5 * width).argmin())]
         area = float(row[k.TOUCH] * (pad[1] - pad[0]) * (pad[3] - pad[2]))
         # a voxel each way, and more at a side that was not seen; an object that turns in the hand gets narrower
-        unsure = (1.0 - float(row[k.SURE])) * 2.0 * step
+        unsure = float(row[k.UNSEEN]) * step
         least = max(float(row[k.NARROW]) * step - 2.0 * step, 0.0)
-        most = min(width + 2.0 * step + unsure, 2.0 * self._shape.opening)
+        most = min(width * (1.0 + _SLACK) + 2.0 * step + unsure, 2.0 * self._shape.opening)
         return Antipodal(T, width, (least, most), area, float(row[k.TILT]), score, parts)
 
     def _clear_of_map(self, T: Array) -> bool:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numba kernels of the search for antipodal grasps.
 
-Coordinates are in voxels: voxel (i, j, k) reaches from (i, j, k) to (i + 1, j + 1, k + 1), the table is the plane z = 0.
+Coordinates are in voxels: voxel (i, j, k) reaches from (i, j, k) to (i + 1, j + 1, k + 1); the table is z = 0.
 A hand has its approach along z and opens along y.
 """
 
@@ -19,18 +19,22 @@ from openarm_grasp.sampling.voxel_kernels import FILLED, FREE, OTHER, SEEN
 _ACROSS, _ALONG = 8, 9
 #: Pads give: what is this near to the first contact touches, voxels.
 _SOFT = 1.3
+#: Rounds that turn the closing axis; slopes of the sides that need no turn, and that are no side that pads meet.
+_ROUNDS, _STRAIGHT, _CROOKED = 3, 0.03, 0.5
 #: The far side is left when so many steps of half a voxel are not of the object.
 _GONE = 4
 
 #: A side that was not seen may reach so much farther out, voxels.
-_UNSEEN = 2.0
+_MOST_UNSEEN = 5
+#: Rays whose first contact is this near to the first of all say how the side of the object is turned, voxels.
+_FLAT = 4.0
 #: Rays that must touch each pad.
 _LEAST_TOUCH = 3.0
 
-#: Columns of `found`: pose (12), width, narrowest, touching share, alignment, lever, off the middle, tilt, certainty,
-#: in shadow, room, pair.
-COLUMNS = 23
-WIDTH, NARROW, TOUCH, ALIGN, LEVER, ASIDE, TILT, SURE, BLIND, ROOM, PAIR = range(12, 23)
+#: Columns of `found`: pose (12), width, narrowest, touching share, alignment, certainty, how far unseen sides may reach
+#: out, slope of the line between the patches, lever, off the middle, tilt, in shadow, room, pair.
+COLUMNS = 25
+WIDTH, NARROW, TOUCH, ALIGN, SURE, UNSEEN, SLOPE, LEVER, ASIDE, TILT, BLIND, ROOM, PAIR = range(12, 25)
 
 
 @njit(cache=True, nogil=True)
@@ -42,9 +46,7 @@ def _cell(cells: Bytes, x: float, y: float, z: float) -> int:
 
 
 @njit(cache=True, nogil=True)
-def pairs(
-    cells: Bytes, normals: Floats, starts: Ints, lean: float, widest: float, least_cos: float, out: Array
-) -> int:
+def pairs(cells: Bytes, normals: Floats, starts: Ints, lean: float, widest: float, least_cos: float, out: Array) -> int:
     """Find opposite contacts: from each start through the object, level and along the normal.
 
     Args:
@@ -80,7 +82,7 @@ def pairs(
             at, last, gone = 0.0, -1.0, 0
             while at < widest + 3.0:
                 what = _cell(cells, px + dx * at, py + dy * at, pz + dz * at)
-                if what == SEEN or what == FILLED:
+                if what in (SEEN, FILLED):
                     last, gone = at, 0
                 else:
                     gone += 1
@@ -102,8 +104,10 @@ def pairs(
 
 @njit(cache=True, nogil=True)
 def _hits(obstacles: Bytes, hand: Array, T: Array, px: float, py: float, pz: float, floor: float, stride: int) -> int:
-    """Return -1 when a hand (n, 3) with rotation of T at p meets an obstacle or comes below `floor`; else its points
-    in the target's shadow."""
+    """Return how many points of a hand (n, 3), turned as T and at p, are in the target's shadow.
+
+    It is -1 when one is in an obstacle or below `floor`.
+    """
     blind = 0
     nx, ny, nz = obstacles.shape
     for n in range(0, hand.shape[0], stride):
@@ -147,7 +151,7 @@ def _between(cells: Bytes, T: Array, pad: Array, opening: float, first: Array, l
                 what = _cell(cells, bx + T[0, 1] * y, by + T[1, 1] * y, bz + T[2, 1] * y)
                 if what == OTHER:
                     return False
-                if what == SEEN or what == FILLED:
+                if what in (SEEN, FILLED):
                     if math.isnan(first[a, b]):
                         first[a, b] = y
                     last[a, b] = y
@@ -156,21 +160,44 @@ def _between(cells: Bytes, T: Array, pad: Array, opening: float, first: Array, l
 
 
 @njit(cache=True, nogil=True)
-def _sure(cells: Bytes, obstacles: Bytes, x: float, y: float, z: float, dx: float, dy: float, dz: float) -> bool:
-    """Whether a contact was seen, or what is two voxels before it (d: outwards) is known to be free."""
+def _unseen(cells: Bytes, x: float, y: float, z: float, dx: float, dy: float, dz: float) -> int:
+    """How far a contact may lie farther out (d): voxels of shadow before it; 0 for one that was seen."""
     if _cell(cells, x, y, z) == SEEN:
-        return True
-    return _cell(cells, x + 2.0 * dx, y + 2.0 * dy, z + 2.0 * dz) == FREE
+        return 0
+    for n in range(2, 2 + _MOST_UNSEEN):
+        if _cell(cells, x + n * dx, y + n * dy, z + n * dz) == FREE:
+            return n - 2
+    return _MOST_UNSEEN
 
 
 @njit(cache=True, nogil=True)
-def _touch(
-    cells: Bytes, obstacles: Bytes, normals: Floats, T: Array, pad: Array, first: Array, last: Array, out: Array
-) -> bool:
-    """Measure the contact patches of both pads: width, narrowest, share that touches, alignment, certainty.
+def _turn(pad: Array, first: Array, last: Array) -> float:
+    """Slope of the sides of the object across the pads, by least squares: dy / dx, mean of both sides."""
+    low, high = math.inf, -math.inf
+    for a in range(_ACROSS):
+        for b in range(_ALONG):
+            if not math.isnan(first[a, b]):
+                low, high = min(low, first[a, b]), max(high, last[a, b])
+    total, sides = 0.0, 0
+    for side in range(2):
+        n = sx = sy = sxx = sxy = 0.0
+        for a in range(_ACROSS):
+            x = pad[0] + (pad[1] - pad[0]) * a / (_ACROSS - 1)
+            for b in range(_ALONG):
+                y = first[a, b] if side == 0 else last[a, b]
+                if math.isnan(y) or (y - low if side == 0 else high - y) > _FLAT:
+                    continue
+                n, sx, sy, sxx, sxy = n + 1.0, sx + x, sy + y, sxx + x * x, sxy + x * y
+        spread = n * sxx - sx * sx
+        if n >= 4.0 and spread > 1.0:
+            total += (n * sxy - sx * sy) / spread
+            sides += 1
+    return total / sides if sides else 0.0
 
-    Also writes the mean normals of both patches to out[5:11].
-    """
+
+@njit(cache=True, nogil=True)
+def _touch(cells: Bytes, normals: Floats, T: Array, pad: Array, first: Array, last: Array, out: Array) -> bool:
+    """Measure the contact patches of both pads: the columns of `found` from WIDTH to SLOPE."""
     low, high = math.inf, -math.inf
     for a in range(_ACROSS):
         for b in range(_ALONG):
@@ -179,9 +206,8 @@ def _touch(
     if high < low:
         return False
     narrow = high - low
-    count = np.zeros(2)
-    sure = np.zeros(2)
-    mean = np.zeros((2, 3))
+    count, sure, unseen, mean = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros((2, 3))
+    where, where_sure = np.zeros((2, 2)), np.zeros((2, 2))
     for a in range(_ACROSS):
         x = pad[0] + (pad[1] - pad[0]) * a / (_ACROSS - 1)
         for b in range(_ALONG):
@@ -197,31 +223,38 @@ def _touch(
                 cx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
                 cy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
                 cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-                i, j, k = math.floor(cx), math.floor(cy), math.floor(cz)
-                n = normals[i, j, k]
+                n = normals[math.floor(cx), math.floor(cy), math.floor(cz)]
                 count[side] += 1.0
-                mean[side, 0] += n[0]
-                mean[side, 1] += n[1]
-                mean[side, 2] += n[2]
+                for axis in range(3):
+                    mean[side, axis] += n[axis]
                 out_y = -1.0 if side == 0 else 1.0
-                if _sure(cells, obstacles, cx, cy, cz, T[0, 1] * out_y, T[1, 1] * out_y, T[2, 1] * out_y):
+                far = _unseen(cells, cx, cy, cz, T[0, 1] * out_y, T[1, 1] * out_y, T[2, 1] * out_y)
+                unseen[side] += far
+                where[side, 0] += x
+                where[side, 1] += z
+                if far == 0:
                     sure[side] += 1.0
+                    where_sure[side, 0] += x
+                    where_sure[side, 1] += z
             if touching == 2:
                 narrow = min(narrow, last[a, b] - first[a, b])
     if min(count[0], count[1]) < _LEAST_TOUCH:
         return False
     align = 1.0
     for side in range(2):
-        size = math.sqrt(mean[side, 0] ** 2 + mean[side, 1] ** 2 + mean[side, 2] ** 2)
-        if size < 1e-6:
-            return False
         along = (mean[side, 0] * T[0, 1] + mean[side, 1] * T[1, 1] + mean[side, 2] * T[2, 1]) / count[side]
         align = min(align, -along if side == 0 else along)
-        for axis in range(3):
-            out[5 + 3 * side + axis] = mean[side, axis] / size
-    # what is measured fills the voxel that it is in: half a voxel too much at each side
-    out[0], out[1], out[2] = max(high - low - 1.0, 0.5), max(narrow - 1.0, 0.0), min(count[0], count[1]) / (_ACROSS * _ALONG)
-    out[3], out[4] = align, min(sure[0] / count[0], sure[1] / count[1])
+        if sure[side] > 0.0:  # what was seen of the patch says where it is
+            where[side] = where_sure[side] / sure[side]
+        else:
+            where[side] = where[side] / count[side]
+    # what is measured fills the voxel that it is in, but pixels at the very edge of an object are lost
+    width = max(high - low - 0.5, 0.5)
+    out[WIDTH], out[NARROW] = width, max(narrow - 0.5, 0.0)
+    out[TOUCH] = min(count[0], count[1]) / (_ACROSS * _ALONG)
+    out[ALIGN], out[SURE] = align, min(sure[0] / count[0], sure[1] / count[1])
+    out[UNSEEN] = unseen[0] / count[0] + unseen[1] / count[1]
+    out[SLOPE] = math.hypot(where[0, 0] - where[1, 0], where[0, 1] - where[1, 1]) / max(width, 4.0)
     return True
 
 
@@ -279,7 +312,7 @@ def search(
     """
     count = 0
     T = np.eye(4)
-    d, contact = np.empty(3), np.empty(11)
+    d, contact = np.empty(3), np.empty(COLUMNS)
     first, last = np.empty((_ACROSS, _ALONG)), np.empty((_ACROSS, _ALONG))
     good = np.zeros(found_pairs.shape[0], np.int64)
     for h in range(hypotheses.shape[0]):
@@ -291,10 +324,10 @@ def search(
         why[0] += 1
         pair, sign = found_pairs[p], hypotheses[h, 3]
         d[0], d[1], d[2] = sign * pair[3], sign * pair[4], sign * pair[5]
-        ok = True
+        ok, pad = True, pads[0]
         middle_x, middle_y, middle_z = pair[0], pair[1], pair[2]
-        for turn in range(2):  # the second time with the closing axis of the contact patches
-            row = min(int(round(0.5 * pair[6] / finger_step)), pads.shape[0] - 1)
+        for turn in range(_ROUNDS):  # again with the closing axis across the sides that the pads meet
+            row = min(round(0.5 * pair[6] / finger_step), pads.shape[0] - 1)
             pad = pads[row]
             if not _frame(d, sign * hypotheses[h, 1], T):
                 ok = False
@@ -328,46 +361,48 @@ def search(
                 why[4] += 1
                 ok = False
                 break
-            if not _touch(cells, obstacles, normals, T, pad, first, last, contact):
-                why[6] += 1
-                ok = False
-                break
-            if contact[0] + _UNSEEN * (1.0 - contact[4]) > widest:
-                why[4] += 1
-                ok = False
-                break
-            # in the middle of what the pads meet
             low, high = math.inf, -math.inf
             for a in range(_ACROSS):
                 for b in range(_ALONG):
                     if not math.isnan(first[a, b]):
                         low, high = min(low, first[a, b]), max(high, last[a, b])
+            if high < low:
+                why[6] += 1
+                ok = False
+                break
+            slope = _turn(pad, first, last)
+            if turn == _ROUNDS - 1 or abs(slope) < _STRAIGHT or abs(slope) > _CROOKED:
+                ok = _touch(cells, normals, T, pad, first, last, contact)
+                why[6] += not ok
+                if ok and contact[WIDTH] + contact[UNSEEN] > widest:
+                    why[4] += 1
+                    ok = False
+            # in the middle of what the pads meet
             off = 0.5 * (low + high)
             for axis in range(3):
                 T[axis, 3] += off * T[axis, 1]
             middle_x += off * T[0, 1]
             middle_y += off * T[1, 1]
             middle_z += off * T[2, 1]
-            if turn == 1:
+            if turn == _ROUNDS - 1 or abs(slope) < _STRAIGHT or abs(slope) > _CROOKED:
                 break
-            nx, ny, nz = contact[8] - contact[5], contact[9] - contact[6], contact[10] - contact[7]
+            size = math.sqrt(1.0 + slope * slope)
+            for axis in range(3):
+                d[axis] = (T[axis, 1] - slope * T[axis, 0]) / size
             if pair[5] == 0.0:
-                nz = 0.0
-            size = math.sqrt(nx * nx + ny * ny + nz * nz)
-            turned = (nx * d[0] + ny * d[1] + nz * d[2]) / max(size, 1e-9)
-            if size < 1e-6 or turned < 0.8 or turned > 0.9995:
-                break
-            d[0], d[1], d[2] = nx / size, ny / size, nz / size
+                d[2] = 0.0
+                size = math.hypot(d[0], d[1])
+                d[0], d[1] = d[0] / size, d[1] / size
         if not ok:
             continue
-        if contact[3] < least_cos:
+        if contact[ALIGN] < least_cos:
             why[7] += 1
             continue
         blind = _hits(obstacles, hand, T, T[0, 3], T[1, 3], T[2, 3], clearance, 1)
         if blind < 0:
             why[3] += 1
             continue
-        steps = int(math.ceil(back / 4.0))
+        steps = math.ceil(back / 4.0)
         for n in range(1, steps + 1):
             far = min(4.0 * n, back)
             bx, by, bz = T[0, 3] - far * T[0, 2], T[1, 3] - far * T[1, 2], T[2, 3] - far * T[2, 2]
@@ -395,11 +430,11 @@ def search(
         z = 0.5 * (pad[2] + pad[3])
         rx, ry = centre[0] - T[0, 3] - z * T[0, 2], centre[1] - T[1, 3] - z * T[1, 2]
         level = max(math.hypot(T[0, 1], T[1, 1]), 1e-6)
-        out[WIDTH], out[NARROW], out[TOUCH], out[ALIGN] = contact[0], contact[1], contact[2], contact[3]
+        out[WIDTH : SLOPE + 1] = contact[WIDTH : SLOPE + 1]
         out[LEVER] = abs(rx * T[1, 1] - ry * T[0, 1]) / level
         out[ASIDE] = abs(rx * T[0, 1] + ry * T[1, 1]) / level
         out[TILT] = math.acos(min(1.0, -T[2, 2]))
-        out[SURE], out[BLIND], out[ROOM], out[PAIR] = contact[4], blind / hand.shape[0], room, p
+        out[BLIND], out[ROOM], out[PAIR] = blind / hand.shape[0], room, p
         good[p] += 1
         count += 1
     return count

@@ -198,7 +198,7 @@ def _candidates(found: Sequence[Antipodal], asked: Sampling, surface: Surface) -
                 score=one.score + side,
                 parts={**one.parts, "side": side},
                 apertures=one.apertures,
-                contact_area=one.contact_area,
+                patch_area=one.patch_area,
                 held=held,
             )
         )

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud of voxels as a few upright boxes that together hold it: what is in the hand, for the planner. Base frame, m."""
+"""A cloud of voxels as a few upright boxes around it: what is in the hand, for the planner. Base frame, m."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from openarm_common import se3
 from openarm_common.types import Array
@@ -15,8 +16,6 @@ from openarm_grasp.planning.candidates import Box
 _SAVED = 0.06
 #: Cuts of a box are tried at so many places along each axis.
 _CUTS = 8
-#: Turns of the boxes that are tried, up to a quarter.
-_TURNS = 18
 
 
 class _Cut(NamedTuple):
@@ -37,7 +36,7 @@ def slabs(label: str, points: Array, step: float, *, gap: float = 0.0, most: int
         gap: The boxes end this far above the lowest voxel, so that what stands on a table is not in collision with it.
         most: Boxes.
     """
-    R = se3.rot_z(_yaw(points[:, :2]))
+    R = se3.rot_z(_yaw(points[:, :2], step))
     parts = [points @ R]
     least = _SAVED * _volume(parts[0], step)
     cuts = [_cut(parts[0], step)]
@@ -58,11 +57,15 @@ def slabs(label: str, points: Array, step: float, *, gap: float = 0.0, most: int
     return tuple(boxes)
 
 
-def _yaw(xy: Array) -> float:
-    """Turn of the smallest rectangle about points (n, 2), rad."""
-    turns = np.arange(_TURNS) * 0.5 * np.pi / _TURNS
-    sizes = [np.ptp(xy @ se3.rot_z(float(turn))[:2, :2], axis=0) for turn in turns]
-    return float(turns[int(np.argmin([float(size.prod()) for size in sizes]))])
+def _yaw(xy: Array, step: float) -> float:
+    """Turn of most walls of the footprint of points (n, 2), rad, to a quarter."""
+    cell = np.floor((xy - xy.min(axis=0)) / step).astype(np.int64) + 3
+    mask = np.zeros(cell.max(axis=0) + 4, np.float32)
+    mask[tuple(cell.T)] = 1.0
+    soft = gaussian_filter(mask, 1.5)
+    gx, gy = np.gradient(soft, axis=0), np.gradient(soft, axis=1)
+    walls = np.hypot(gx, gy) * np.exp(4.0j * np.arctan2(gy, gx))
+    return float(np.angle(walls.sum())) / 4.0
 
 
 def _volume(points: Array, step: float) -> float:

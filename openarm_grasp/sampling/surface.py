@@ -11,14 +11,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import ceil
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter1d
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array, Bytes, Floats
 from openarm_grasp.sampling import voxel_kernels as kernels
-from openarm_grasp.sampling.voxel_kernels import FILLED, HIDDEN, SEEN, SHADOW
+from openarm_grasp.sampling.voxel_kernels import FILLED, FREE, HIDDEN, SEEN, SHADOW
 
 #: Edge of a voxel, m.
 VOXEL = 0.0025
@@ -43,12 +44,15 @@ class View:
         target: (n, 3) or (h, w, 3) points of the object.
         others: (n, 3) or (h, w, 3) points of everything else that stands there.
         table: (n, 3) or (h, w, 3) points of the table; they say what is free.
+        whole: It looks at all that is around the object: what nothing hides from it is free. Of a view that is not
+            whole, only what its rays have passed is.
     """
 
     camera: Array
     target: Array
     others: Array = field(default_factory=lambda: _NOTHING)
     table: Array = field(default_factory=lambda: _NOTHING)
+    whole: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +141,9 @@ def fuse(views: Sequence[View], table_z: float, *, step: float = VOXEL, around: 
     reach = np.array([high[0] + around, high[1] + around, np.inf])
     others = [(p := _cloud(view.others, corner))[(p < reach).all(axis=1)] for view in views]
     above = max(float(p[:, 2].max(initial=table_z)) for p in (target, *others))
-    shape = np.ceil((np.array([reach[0], reach[1], above]) - corner) / step).astype(int) + (1, 1, 4)
+    spans = (np.array([reach[0], reach[1], above]) - corner) / step
+    nx, ny, nz = (ceil(float(span)) + margin for span, margin in zip(spans, (1, 1, 4), strict=True))
+    shape = (nx, ny, nz)
 
     def local(points: Array) -> Array:
         return np.ascontiguousarray((points - corner) / step)
@@ -147,12 +153,15 @@ def fuse(views: Sequence[View], table_z: float, *, step: float = VOXEL, around: 
     kernels.count(local(target), counts)
     rest = local(np.concatenate([_NOTHING, *others]))
     kernels.count(rest, around_counts)
-    nx, ny = int(shape[0]), int(shape[1])
     kernels.fill(kernels.heights(local(target), nx, ny), kernels.heights(rest, nx, ny), counts, around_counts, cells)
+    unknown: list[Bytes] = []
     for view, own, other in zip(views, mine, others, strict=True):
-        eye = local(view.camera)
-        kernels.shade(local(other), eye, HIDDEN, cells)
-        kernels.shade(local(own), eye, SHADOW, cells)
+        if view.whole or not any(one.whole for one in views):
+            unknown.append(cells.copy())
+            kernels.shade(local(other), local(view.camera), HIDDEN, unknown[-1])
+            kernels.shade(local(own), local(view.camera), SHADOW, unknown[-1])
+    # hidden from all that look there
+    cells = np.where(np.min(unknown, axis=0) == FREE, cells, np.max(unknown, axis=0))
     for view, own, other in zip(views, mine, others, strict=True):
         for points in (own, other, _cloud(view.table, np.full(3, -np.inf))):
             kernels.passed(local(points), local(view.camera), rays)
@@ -199,8 +208,10 @@ def _normals(cells: Bytes) -> Floats:
     low = np.maximum(where.min(axis=0) - pad, 0)
     high = where.max(axis=0) + pad
     part = (slice(low[0], high[0]), slice(low[1], high[1]), slice(0, high[2]))
-    soft = gaussian_filter(solid[part].astype(np.float32), _BLUR, mode=("constant", "constant", "nearest"), truncate=2.0)
-    gradient = -np.stack(np.gradient(soft), axis=-1)
+    soft = solid[part].astype(np.float32)
+    for axis, mode in ((0, "constant"), (1, "constant"), (2, "nearest")):
+        soft = gaussian_filter1d(soft, _BLUR, axis=axis, mode=mode, truncate=2.0)
+    gradient = np.stack([-np.gradient(soft, axis=axis) for axis in range(3)], axis=-1)
     size = np.linalg.norm(gradient, axis=-1, keepdims=True)
     normals[part] = np.where(size > 1e-4, gradient / np.maximum(size, 1e-4), 0.0)
     return normals

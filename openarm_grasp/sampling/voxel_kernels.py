@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numba kernels of the fused surface: what fills each voxel, what lies in shadow, what a ray has passed.
 
-Coordinates are in voxels: voxel (i, j, k) reaches from (i, j, k) to (i + 1, j + 1, k + 1), the table is the plane z = 0.
+Coordinates are in voxels: voxel (i, j, k) reaches from (i, j, k) to (i + 1, j + 1, k + 1); the table is z = 0.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def carve(rays: Bytes, around: Counts, cells: Bytes) -> None:
         for j in range(ny):
             for k in range(nz):
                 what = cells[i, j, k]
-                guess = what == FILLED or what == SHADOW or what == HIDDEN or (what == OTHER and not around[i, j, k])
+                guess = what in (FILLED, SHADOW, HIDDEN) or (what == OTHER and not around[i, j, k])
                 if guess and rays[i, j, k] >= _PASSED:
                     cells[i, j, k] = FREE
 
@@ -207,7 +207,7 @@ def grow(cells: Bytes, out: Bytes) -> None:
                 what = cells[i, j, k]
                 if what == FREE:
                     continue
-                if what == SHADOW or what == HIDDEN:
+                if what in (SHADOW, HIDDEN):
                     if out[i, j, k] != 1:
                         out[i, j, k] = 2 if what == SHADOW else 3
                     continue
@@ -249,4 +249,4 @@ def boundary(cells: Bytes) -> Ints:
 
 @njit(cache=True, nogil=True)
 def _is_target(cell: int) -> bool:
-    return cell == SEEN or cell == FILLED
+    return cell in (SEEN, FILLED)

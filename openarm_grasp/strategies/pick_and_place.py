@@ -89,7 +89,7 @@ async def _attempts(run: Run) -> GraspOutcome:
         try:
             if plan is not None:
                 grasp, plan, why = await approach(run, grasp, plan, why)
-                why = await close(run, grasp, why)
+                grasp, why = await close(run, grasp, why)
                 gripper, camera, why = await lift(run, grasp, plan, why)
                 if run.request.phase == "pick":
                     return succeeded(run, f"{why}; the {run.arm} hand keeps it", gripper=gripper, camera=camera)
@@ -205,8 +205,11 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[
 
 
 # --- grasp
-async def close(run: Run, grasp: Grasp, why: str) -> str:
+async def close(run: Run, grasp: Grasp, why: str) -> tuple[Grasp, str]:
     """Pause, close until the fingers stop, let them settle, and judge by them whether they hold the object.
+
+    Returns:
+        The grasp, with the aperture after closing when the object is no box, and the reason.
 
     Raises:
         OpenArmError: With the code of the grip, when they do not hold it.
@@ -220,14 +223,16 @@ async def close(run: Run, grasp: Grasp, why: str) -> str:
         await robot.close(arm, "close", run.config.hand.close_effort)
         await robot.wait(timing.after_close)
         evidence = await robot.measure(arm, c.width, c.T_base_tcp, settle=timing.settle_limit)
-        gripper = verdicts.judge_grip(evidence, run.config.held)
+        gripper = grasp.judge(evidence, run.config.held)
         if not gripper.ok:
             raise OpenArmError(gripper.code, gripper.reason)
     except OpenArmError as error:
         reraise_stop(error)
         run.hand = Hand.AT_OBJECT
         raise
-    return gripper.reason
+    if c.apertures is not None:
+        run.grasp = grasp = replace(grasp, closed=evidence.gap)
+    return grasp, gripper.reason
 
 
 async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[GripperVerdict, CameraVerdict, str]:
@@ -249,7 +254,7 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
         raise
     evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
     frames = (await robot.observe(_LIFT_FRAMES)).frames
-    gripper = verdicts.judge_grip(evidence, config.held, was_held=True)
+    gripper = grasp.judge(evidence, config.held, was_held=True)
     camera = verdicts.judge_sight(
         sighting.target,
         frames,
@@ -305,7 +310,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
     try:
         await robot.follow(arm, plan.transfer, "carry", carrying=True)
         evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
-        gripper = verdicts.judge_grip(evidence, config.held, was_held=True)
+        gripper = grasp.judge(evidence, config.held, was_held=True)
         if not gripper.ok:
             raise OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}")
         run.enter(State.PLACE, gripper.reason)

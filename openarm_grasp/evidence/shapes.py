@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a camera says of a thing of any shape: whether its cluster has left its place, and stands where it should.
+
+A box that is fitted to a shape that is none changes with the view. So a cluster is judged by its centroid, its height
+and its extent. What the border of the image or the robot cuts off proves nothing: neither that a thing is there, nor
+that it has gone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
+from openarm_grasp.config import HeldConfig
+from openarm_grasp.evidence.verdicts import CameraVerdict
+
+#: A thing that rests as it rested is as high as before, m, or to this share of its height.
+_HEIGHT, _HEIGHT_SHARE = 0.008, 0.08
+#: Its largest horizontal extent is as before, m, or to this share of it: another view sees other sides.
+_EXTENT, _EXTENT_SHARE = 0.015, 0.25
+#: A cluster with a smaller share of the points of the thing is a remainder of something else.
+_SAME_THING = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Cluster:
+    """What one image shows of one thing; base frame, m.
+
+    Attributes:
+        centroid: (3,) middle of its points.
+        top: Height of its upper end.
+        extent: Largest horizontal distance between two of its points, about.
+        points: How many.
+        cut: Whether the border of the image, the robot or another thing cuts it.
+    """
+
+    centroid: Array
+    top: float
+    extent: float
+    points: int
+    cut: bool = False
+
+    @classmethod
+    def of(cls, points: Array, *, cut: bool = False) -> Cluster:
+        """Measure points (n, 3) or (h, w, 3); those that are not finite are left out.
+
+        Raises:
+            OpenArmError: NOTHING_DETECTED, when there is none.
+        """
+        flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        flat = flat[np.isfinite(flat).all(axis=1)]
+        if not len(flat):
+            raise OpenArmError(Code.NOTHING_DETECTED, "a cluster without finite points, expected at least one")
+        turns = np.linspace(0.0, np.pi, 12, endpoint=False)
+        along = flat[:, :2] @ np.stack([np.cos(turns), np.sin(turns)])
+        # a few points that fly make neither the top nor the extent
+        top = float(np.percentile(flat[:, 2], 98.0))
+        extent = float(np.ptp(np.percentile(along, (1.0, 99.0), axis=0), axis=0).max())
+        return cls(flat.mean(axis=0), top, extent, len(flat), cut)
+
+
+@dataclass(frozen=True, eq=False)
+class ClusterFrame:
+    """All clusters of one image.
+
+    Attributes:
+        t_ns: Stamp of the image.
+        clusters: What is on the table, and what hangs over it; the robot left out.
+        place_in_view: Whether the place that is asked about is in the image, and the robot does not hide it.
+    """
+
+    t_ns: int
+    clusters: tuple[Cluster, ...]
+    place_in_view: bool = True
+
+
+def judge_gone(
+    before: Cluster, frames: Sequence[ClusterFrame], config: HeldConfig, *, match_radius: float
+) -> CameraVerdict:
+    """Whether a thing has left its place: GRASP_MISSED, when it is still there; STALE_DATA, when nothing shows it.
+
+    Args:
+        before: The thing as it was before the grasp.
+        frames: Taken after the lift; each whose view of the place is free counts.
+        config: Thresholds.
+        match_radius: Horizontal distance that counts as the old place, m.
+    """
+    showing = [frame for frame in frames if frame.place_in_view]
+    if not showing:
+        what = "no camera frame after the lift" if not frames else "the robot or the border hides where the object was"
+        return CameraVerdict(Code.STALE_DATA, f"{what}: nothing shows whether it has gone")
+    highest = 0.0
+    for frame in showing:
+        for cluster in frame.clusters:
+            away = _apart(cluster, before.centroid)
+            risen = cluster.top - before.top
+            if away > match_radius + 0.5 * cluster.extent or cluster.points < _SAME_THING * before.points:
+                continue
+            if risen >= config.rise:
+                highest = max(highest, risen)
+            elif away <= match_radius:
+                text = f"something of its height still stands at its place ({away * 1e3:.0f} mm from it)"
+                return CameraVerdict(Code.GRASP_MISSED, text)
+    text = f", and is seen {highest * 1e3:.0f} mm higher" if highest else ""
+    return CameraVerdict(Code.OK, f"the cluster has gone from its place{text}")
+
+
+def judge_rests(before: Cluster, p_expected: Array, frames: Sequence[ClusterFrame], tolerance: float) -> CameraVerdict:
+    """Whether a thing rests at its target as it rested before the grasp.
+
+    Args:
+        before: The thing as it was; one that was cut off proves nothing.
+        p_expected: (2,) or (3,) where its centroid should be, base frame, m; z is not read.
+        frames: Taken after the arm has left; the newest that shows it counts.
+        tolerance: Largest horizontal distance, m.
+    """
+    if not frames:
+        return CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
+    if before.cut:
+        return CameraVerdict(
+            Code.PLACE_FAILED, "the object was cut off when it was first seen: its centroid is not known"
+        )
+    reach = tolerance + 0.5 * before.extent
+    cut = False
+    for frame in reversed(frames):
+        near = [c for c in frame.clusters if _apart(c, p_expected) <= reach and c.points >= _SAME_THING * before.points]
+        whole = [c for c in near if not c.cut]
+        cut = cut or len(whole) < len(near)
+        if whole and frame.place_in_view:
+            return _compare(before, min(whole, key=lambda c: _apart(c, p_expected)), p_expected, tolerance)
+    why = "is cut off by the border, the robot or another thing" if cut else "is not in view"
+    return CameraVerdict(Code.PLACE_FAILED, f"the object {why} after the place: nothing shows that it stands there")
+
+
+def _compare(before: Cluster, now: Cluster, p_expected: Array, tolerance: float) -> CameraVerdict:
+    away = _apart(now, p_expected)
+    text = f"the cluster is {away * 1e3:.0f} mm from its target"
+    if away > tolerance:
+        return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
+    stood = before.top - _floor(before)
+    higher = now.top - before.top
+    if abs(higher) > max(_HEIGHT, _HEIGHT_SHARE * stood):
+        was = f"it is {abs(higher) * 1e3:.0f} mm {'higher' if higher > 0.0 else 'lower'} than it was"
+        return CameraVerdict(Code.PLACE_FAILED, f"the object does not rest as it did: {was}", final=True)
+    wider = now.extent - before.extent
+    if abs(wider) > max(_EXTENT, _EXTENT_SHARE * before.extent):
+        was = f"seen from above it is {abs(wider) * 1e3:.0f} mm {'longer' if wider > 0.0 else 'shorter'} than it was"
+        return CameraVerdict(Code.PLACE_FAILED, f"the object does not rest as it did: {was}", final=True)
+    return CameraVerdict(Code.OK, text)
+
+
+def _floor(c: Cluster) -> float:
+    """About the height of what it stands on: its points are above that, half of them below their middle, m."""
+    return 2.0 * float(c.centroid[2]) - c.top
+
+
+def _apart(c: Cluster, p: Array) -> float:
+    return float(np.linalg.norm(c.centroid[:2] - p[:2]))

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evidence for things of any shape: interval of the aperture, clusters that left their place and rest at the target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import HeldConfig
+from openarm_grasp.evidence.shapes import Cluster, ClusterFrame, judge_gone, judge_rests
+from openarm_grasp.evidence.verdicts import Evidence, judge_grip
+
+HELD = HeldConfig()
+STOOD = Cluster(np.array([0.27, -0.2, 0.42]), 0.44, 0.12, 800)
+
+
+def grip(gap, **kwargs):
+    return judge_grip(Evidence(gap, 0.03, -30.0, 0.0), HELD, apertures=(0.022, 0.041), **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("gap", "code"),
+    [
+        (0.0221, Code.OK),
+        (0.0409, Code.OK),
+        (0.0215, Code.GRASP_MISSED),
+        (0.0415, Code.HAND_COLLISION),
+        (0.001, Code.GRASP_MISSED),
+    ],
+)
+def test_the_gap_must_be_in_the_interval_of_the_contact_patch(gap, code):
+    assert grip(gap).code is code
+
+
+def test_an_interval_that_begins_at_nothing_takes_no_closed_hand_for_held():
+    assert judge_grip(Evidence(0.002, 0.01, -30.0, 0.0), HELD, apertures=(0.0, 0.02)).code is Code.GRASP_MISSED
+
+
+def test_the_gap_after_closing_is_the_reference_for_slip():
+    assert grip(0.031, was_held=True, closed=0.030).ok
+    lost = grip(0.0345, was_held=True, closed=0.030)
+    assert lost.code is Code.GRASP_LOST
+    assert "34.5 mm" in lost.reason
+    assert "30.0 mm" in lost.reason
+
+
+def test_a_prism_is_judged_by_its_width_as_before():
+    assert judge_grip(Evidence(0.036, 0.03, -30.0, 0.0), HELD).code is Code.HAND_COLLISION
+    assert judge_grip(Evidence(0.034, 0.03, -30.0, 0.0), HELD).ok
+
+
+def frame(*clusters, in_view=True):
+    return ClusterFrame(0, clusters, in_view)
+
+
+def at(x, y, **changes):
+    return replace(STOOD, centroid=np.array([x, y, STOOD.centroid[2]]), **changes)
+
+
+@pytest.mark.parametrize(
+    ("frames", "code", "words"),
+    [
+        ([frame()], Code.OK, "has gone from its place"),
+        ([frame(at(0.27, -0.2))], Code.GRASP_MISSED, "still stands"),
+        ([frame(), frame(at(0.28, -0.2))], Code.GRASP_MISSED, "still stands"),
+        ([frame(at(0.27, -0.2, top=0.55))], Code.OK, "110 mm higher"),
+        ([frame(at(0.27, -0.2, points=100))], Code.OK, "has gone"),
+        ([frame(at(0.40, -0.3))], Code.OK, "has gone"),
+        ([frame(in_view=False)], Code.STALE_DATA, "hides where the object was"),
+        ([frame(in_view=False), frame()], Code.OK, "has gone"),
+        ([], Code.STALE_DATA, "no camera frame"),
+    ],
+)
+def test_a_cluster_has_gone_only_when_a_free_view_shows_its_place_empty(frames, code, words):
+    verdict = judge_gone(STOOD, frames, HELD, match_radius=0.03)
+    assert verdict.code is code
+    assert words in verdict.reason
+
+
+@pytest.mark.parametrize(
+    ("frames", "code", "words"),
+    [
+        ([frame(at(0.31, 0.101))], Code.OK, "mm from its target"),
+        ([frame(at(0.33, 0.1))], Code.PLACE_FAILED, "30 mm from its target"),
+        ([frame(at(0.30, 0.1, top=0.455))], Code.PLACE_FAILED, "15 mm higher"),
+        ([frame(at(0.30, 0.1, top=0.43))], Code.PLACE_FAILED, "10 mm lower"),
+        ([frame(at(0.30, 0.1, extent=0.16))], Code.PLACE_FAILED, "40 mm longer"),
+        ([frame(at(0.30, 0.1, extent=0.08))], Code.PLACE_FAILED, "40 mm shorter"),
+        ([frame(at(0.30, 0.1, cut=True))], Code.PLACE_FAILED, "cut off"),
+        ([frame(at(0.30, 0.1, points=100))], Code.PLACE_FAILED, "not in view"),
+        ([frame()], Code.PLACE_FAILED, "not in view"),
+        ([frame(at(0.30, 0.1)), frame(at(0.30, 0.1, cut=True))], Code.OK, "mm from its target"),
+        ([], Code.STALE_DATA, "no camera frame"),
+    ],
+)
+def test_a_thing_rests_where_its_centroid_is_as_high_and_as_long_as_before(frames, code, words):
+    verdict = judge_rests(STOOD, np.array([0.30, 0.1]), frames, 0.02)
+    assert verdict.code is code
+    assert words in verdict.reason
+
+
+def test_what_was_cut_off_when_it_was_first_seen_is_never_said_to_be_placed():
+    verdict = judge_rests(replace(STOOD, cut=True), np.array([0.30, 0.1]), [frame(at(0.30, 0.1))], 0.02)
+    assert verdict.code is Code.PLACE_FAILED
+
+
+def test_a_cluster_is_measured_without_its_few_flying_points():
+    rng = np.random.default_rng(3)
+    points = np.column_stack(
+        [rng.uniform(0.2, 0.3, 2000), rng.uniform(-0.22, -0.18, 2000), rng.uniform(0.4, 0.44, 2000)]
+    )
+    points[::200] += (0.0, 0.0, 0.3)
+    points[5] = np.nan
+    cluster = Cluster.of(points.reshape(-1, 10, 3))
+    assert cluster.points == 1999
+    assert cluster.top == pytest.approx(0.44, abs=0.002)
+    assert cluster.extent == pytest.approx(0.1, abs=0.006)
+    with pytest.raises(OpenArmError, match="without finite points"):
+        Cluster.of(np.full((4, 3), np.nan))
