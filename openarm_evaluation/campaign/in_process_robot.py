@@ -266,6 +266,9 @@ def approach_of(request: PlanGrasp | PlanPlace) -> ApproachRequest:
     ways = request.candidates if isinstance(request, PlanGrasp) else request.targets
     targets = tuple(Target(w.id, w.T_base_tcp, w.approach_offset, w.retreat_offset, w.score) for w in ways)
     if isinstance(request, PlanGrasp):
-        obstacles, touchable = boxes_of((*request.obstacles, request.target)), frozenset({request.target.id})
+        obstacles, touchable = (
+            boxes_of((*request.obstacles, *request.target)),
+            frozenset(box.id for box in request.target),
+        )
         return ApproachRequest(targets, obstacles, touchable=touchable, attached_after=True)
-    return ApproachRequest(targets, boxes_of(request.obstacles), boxes_of((request.held,)), detached_after=True)
+    return ApproachRequest(targets, boxes_of(request.obstacles), boxes_of(request.held), detached_after=True)

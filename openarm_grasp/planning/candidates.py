@@ -276,13 +276,19 @@ def obstacle_boxes(others: Sequence[Detection], config: GraspConfig) -> tuple[Bo
     return tuple(boxes)
 
 
-def held_box(target: Detection, candidate: GraspCandidate, config: GraspConfig) -> Box:
+def target_boxes(target: Detection, candidate: GraspCandidate | None, config: GraspConfig) -> tuple[Box, ...]:
+    """As `target_box`; of what is no box, the boxes about its cloud that a grasp has."""
+    return candidate.held if candidate is not None and candidate.held else (target_box(target, config),)
+
+
+def held_boxes(target: Detection, candidate: GraspCandidate, config: GraspConfig) -> tuple[Box, ...]:
     """The object in the closed hand, TCP frame."""
-    box = target_box(target, config)
-    return Box(box.id, se3.inverse(candidate.T_base_tcp) @ box.T_frame_box, box.size)
+    T_tcp_base = se3.inverse(candidate.T_base_tcp)
+    boxes = target_boxes(target, candidate, config)
+    return tuple(Box(box.id, T_tcp_base @ box.T_frame_box, box.size) for box in boxes)
 
 
 def object_in(box: Box, config: GraspConfig) -> tuple[Array, Array]:
-    """Edges (3,) of the object whose `held_box` this is, and its pose (4, 4) in the TCP frame."""
+    """Edges (3,) of the object whose `held_boxes` is this one, and its pose (4, 4) in the TCP frame."""
     gap = min(config.approach.table_gap, float(box.size[2]))
     return box.size + np.array([0.0, 0.0, gap]), box.T_frame_box @ se3.make(p=(0.0, 0.0, -0.5 * gap))

@@ -100,13 +100,27 @@ def ways(
     if not failed:
         return Ways(propose(target, config, hand, shoulder_xy=shoulder_xy, others=others), ())
     after_collision = any(one.code is Code.HAND_COLLISION for one in failed)
+    height = _RAISED_AFTER_COLLISION if after_collision else _RAISED
+    offered = propose(target, config, hand, shoulder_xy=shoulder_xy, others=others)
+    higher = propose(target, config, hand, shoulder_xy=shoulder_xy, others=others, raised=RAISE)
+    raised = (replace(one, score=one.score + height, parts={**one.parts, "raised": height}) for one in higher)
+    return among((*offered, *raised), target, failed)
+
+
+def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence[FailedGrasp]) -> Ways:
+    """Rank grasps that a sampler has found for the next attempt: fingers go to other sides first.
+
+    Args:
+        offered: Best first.
+        target: The object as it is seen now.
+        failed: What has failed so far.
+    """
+    if not failed:
+        return Ways(tuple(offered), ())
     ranked: list[GraspCandidate] = []
-    for raised in (0.0, RAISE):
-        for one in propose(target, config, hand, shoulder_xy=shoulder_xy, others=others, raised=raised):
-            score = _SAME_SIDES * max(past.sides(one) for past in failed)
-            if raised:
-                score += _RAISED_AFTER_COLLISION if after_collision else _RAISED
-            ranked.append(replace(one, score=one.score + score, parts={**one.parts, "retry": score}))
+    for one in offered:
+        score = _SAME_SIDES * max(past.sides(one) for past in failed)
+        ranked.append(replace(one, score=one.score + score, parts={**one.parts, "retry": score}))
     ranked.sort(key=lambda c: -c.score)
     again = [any(past.repeated_by(one, target) for past in failed) for one in ranked]
     fresh = tuple(one for one, is_repeat in zip(ranked, again, strict=True) if not is_repeat)

@@ -27,13 +27,14 @@ class PlanGrasp:
     """Choose and plan one of the candidates with one arm; result `Planned`.
 
     Attributes:
+        target: The object, as one box or several, base frame; the fingers may touch it, and it goes with the hand.
         ignore_regions: Where the object will not stand any more then: the map still shows it there.
     """
 
     arm: str
     candidates: tuple[GraspCandidate, ...]
     obstacles: tuple[Box, ...]
-    target: Box
+    target: tuple[Box, ...]
     ignore_regions: tuple[Box, ...] = ()
 
 
@@ -42,7 +43,7 @@ class PlanPlace:
     """Choose and plan one of the place targets; result `Planned`.
 
     Attributes:
-        held: What the hand carries, TCP frame.
+        held: What the hand carries, as one box or several, TCP frame.
         after: Trajectory whose end is the start; None starts at the present joints.
         ignore_regions: Where the object stood: the map may not know yet that it was taken away.
     """
@@ -50,7 +51,7 @@ class PlanPlace:
     arm: str
     targets: tuple[PlaceTarget, ...]
     obstacles: tuple[Box, ...]
-    held: Box
+    held: tuple[Box, ...]
     after: Trajectory | None = None
     ignore_regions: tuple[Box, ...] = ()
 

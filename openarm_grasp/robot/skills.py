@@ -20,7 +20,15 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
 from openarm_grasp.evidence.verdicts import Evidence
 from openarm_grasp.perception.detections import Sighting, in_base
-from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget, held_box, obstacle_boxes, target_box
+from openarm_grasp.planning.candidates import (
+    Box,
+    GraspCandidate,
+    PlaceTarget,
+    held_boxes,
+    obstacle_boxes,
+    target_box,
+    target_boxes,
+)
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
 #: The map shows an object so much wider than it is, m.
@@ -128,7 +136,8 @@ class Skills:
             now: The object where it stands until then, when that is elsewhere: the map shows it there.
         """
         config = self._config
-        target, obstacles = target_box(found.target, config), obstacle_boxes(found.others, config)
+        target = target_boxes(found.target, ways[0] if ways else None, config)
+        obstacles = obstacle_boxes(found.others, config)
         gone = () if now is None else (target_box(now.target, config),)
         return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone))
 
@@ -149,7 +158,7 @@ class Skills:
             candidate: How the hand holds it.
             after: Trajectory whose end is the start; None starts at the present joints.
         """
-        held, obstacles = held_box(found.target, candidate, self._config), obstacle_boxes(found.others, self._config)
+        held, obstacles = held_boxes(found.target, candidate, self._config), obstacle_boxes(found.others, self._config)
         stood, lift = target_box(found.target, self._config), self._config.approach.lift_height
         grown = np.array([2.0 * _CELL, 2.0 * _CELL, lift])
         column = Box(stood.id, se3.make(p=(0.0, 0.0, 0.5 * lift)) @ stood.T_frame_box, stood.size + grown)

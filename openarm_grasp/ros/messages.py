@@ -215,12 +215,12 @@ def plan_goal(request: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanAppr
     )
     if isinstance(request, PlanGrasp):
         goal.targets = _targets(request.candidates)
-        goal.obstacles = [box_to_msg(box) for box in (*request.obstacles, request.target)]
-        goal.touchable, goal.attached_after_approach = [request.target.id], True
+        goal.obstacles = [box_to_msg(box) for box in (*request.obstacles, *request.target)]
+        goal.touchable, goal.attached_after_approach = [box.id for box in request.target], True
         return goal
     goal.targets = _targets(request.targets)
     goal.obstacles = [box_to_msg(box) for box in request.obstacles]
-    goal.attached, goal.detached_after_approach = [box_to_msg(request.held)], True
+    goal.attached, goal.detached_after_approach = [box_to_msg(box) for box in request.held], True
     if request.after is not None:
         points = getattr(request.after, "points", None)
         if not points:

@@ -53,7 +53,8 @@ def slabs(label: str, points: Array, step: float, *, gap: float = 0.0, most: int
     for n, part in enumerate(parts):
         low, high = part.min(axis=0) - 0.5 * step, part.max(axis=0) + 0.5 * step
         low[2] = min(max(low[2], floor), high[2] - step)
-        boxes.append(Box(f"target/{label}_{n}", se3.make(R, R @ (0.5 * (low + high))), high - low))
+        name = f"target/{label}_{n}" if len(parts) > 1 else f"target/{label}"
+        boxes.append(Box(name, se3.make(R, R @ (0.5 * (low + high))), high - low))
     return tuple(boxes)
 
 

@@ -47,7 +47,8 @@ async def find_grasp(run: Run, why: str) -> tuple[Grasp, Planned | None, str]:
     while True:
         sighting = await detect(run, why)
         if run.kept is not None:
-            grasp = run.grasp = _grasp(run, run.kept.arm, sighting, run.kept.candidate)
+            grasp = _grasp(run, run.kept.arm, sighting, run.kept.candidate)
+            grasp = run.grasp = replace(grasp, closed=run.kept.closed)
             why = f"the {grasp.arm} hand holds {run.label!r}; {len(grasp.places)} ways to place it"
             if run.request.dry_run:
                 _, target = await plan_place(run, grasp, grasp.places, why)

@@ -92,5 +92,7 @@ def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidate
     others = candidates.obstacle_boxes(grasp.sighting.others, run.config)
     if placed is None:
         return others
-    held = candidates.held_box(grasp.sighting.target, grasp.candidate, run.config)
-    return (*others, candidates.Box(f"placed/{run.label}", placed.target.T_base_tcp @ held.T_frame_box, held.size))
+    held = candidates.held_boxes(grasp.sighting.target, grasp.candidate, run.config)
+    T = placed.target.T_base_tcp
+    stands = (candidates.Box(b.id.replace("target/", "placed/", 1), T @ b.T_frame_box, b.size) for b in held)
+    return (*others, *stands)

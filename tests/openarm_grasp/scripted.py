@@ -243,7 +243,7 @@ class World(Skills):
             return answer
         if isinstance(request, PlanGrasp):
             self._reach(request.arm, request.candidates[0].T_base_tcp[:2, 3])
-            self._label = request.target.id.removeprefix("target/")
+            self._label = request.target[0].id.removeprefix("target/")
             return self._planned(0, "transfer", "approach", "lift")
         within = [i for i, way in enumerate(request.targets) if self.reaches(request.arm, way.position)]
         if not within:

@@ -16,7 +16,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import (
-    held_box,
+    Box,
+    held_boxes,
     obstacle_boxes,
     propose,
     target_box,
@@ -236,7 +237,16 @@ def test_obstacles_are_inflated_sideways_and_upwards():
 
 def test_held_box_is_the_target_seen_from_the_hand():
     target, c = box(), propose(box(), CONFIG, HAND)[0]
-    held = held_box(target, c, CONFIG)
+    (held,) = held_boxes(target, c, CONFIG)
     assert c.T_base_tcp @ held.T_frame_box == pytest.approx(target_box(target, CONFIG).T_frame_box)
     # Centred between the fingers.
     assert held.T_frame_box[1, 3] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_is_no_box_is_held_as_the_boxes_about_its_cloud():
+    target, c = box(), propose(box(), CONFIG, HAND)[0]
+    parts = tuple(Box(f"target/red_{n}", se3.make(p=(0.3, -0.2, 0.42 + n * 0.02)), np.full(3, 0.02)) for n in (0, 1))
+    held = held_boxes(target, replace(c, held=parts), CONFIG)
+    assert [one.id for one in held] == ["target/red_0", "target/red_1"]
+    for one, part in zip(held, parts, strict=True):
+        assert c.T_base_tcp @ one.T_frame_box == pytest.approx(part.T_frame_box)

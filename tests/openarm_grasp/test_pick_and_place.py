@@ -140,7 +140,7 @@ def test_others_are_obstacles_and_the_target_may_be_touched(world):
     world.grasp()
     plan = world.done(PlanGrasp)[0]
     assert [b.id for b in plan.obstacles] == ["detected/blue_0"]
-    assert plan.target.id == "target/red"
+    assert [box.id for box in plan.target] == ["target/red"]
 
 
 def test_dry_run_plans_both_and_moves_nothing(world):

@@ -17,7 +17,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import propose
-from openarm_grasp.planning.retries import FailedGrasp, ways
+from openarm_grasp.planning.retries import FailedGrasp, among, ways
 from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from tests.openarm_grasp.scripted import World, standing
@@ -181,3 +181,14 @@ def test_an_arm_that_missed_leaves_the_next_attempt_to_the_other_where_both_reac
         assert [one.arm for one in attempts(World(target), [target], [0], [Code.GRASP_MISSED])] == arms
     lost = attempts(World(near), [near], [0], [Code.GRASP_LOST])
     assert [one.arm for one in lost] == ["right"] * 3
+
+
+def test_of_sampled_grasps_the_one_that_failed_comes_last_and_other_sides_first():
+    target = standing("red", 0.26, -0.2)
+    offered = propose(target, CONFIG, HAND)
+    assert among(offered, target, ()).fresh == offered
+    failed = FailedGrasp.of(Code.GRASP_MISSED, "right", offered[0], target)
+    left = among(offered, target, (failed,))
+    assert offered[0].id in {c.id for c in left.repeats}
+    assert failed.sides(left.fresh[0]) < 0.1
+    assert {c.id for c in (*left.fresh, *left.repeats)} == {c.id for c in offered}

@@ -107,7 +107,7 @@ def _graspable(scene: Scene, arm: str) -> bool:
     target = Detection(item.label, 1.0, T, np.array(item.size))
     solver = arms_behind((), table)[arm]
     grasps = propose(target, config, RobotDescription.load().hand(arm).parts)
-    request = approach_of(PlanGrasp(arm, grasps, (), target_box(target, config)))
+    request = approach_of(PlanGrasp(arm, grasps, (), (target_box(target, config),)))
     try:
         plan_approach(solver, solver.start_state(_home()), request)
     except OpenArmError as error:
