@@ -13,9 +13,15 @@ import pytest
 import yaml
 
 from openarm_bringup.supervision.graph import load_graph
+from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
+from openarm_common.robot.description import RobotDescription
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.sampling.samplers import Sampling, make_sampler
+from openarm_grasp.sampling.surface import View, fuse
 from openarm_grasp.strategies import registry
 from openarm_motion.planning.planner import PlanQuery, make_planner
 from openarm_sim_bridge.drafting.edits import Edits, matching
@@ -81,6 +87,20 @@ def test_the_detector_finds_what_is_colourful() -> None:
     assert (whole.label, whole.centre, whole.size, whole.truncated) == ("colourful", (64.5, 49.5), (30, 20), False)
     assert whole.mask.all()
     assert cut.truncated
+
+
+def test_the_sampler_is_named_by_a_parameter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_samplers.py").write_text(example("A grasp sampler", "python"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    edge = np.linspace(-0.025, 0.025, 30)
+    top = np.stack(np.meshgrid(0.27 + edge, -0.2 + edge, [0.45]), axis=-1)
+    surface = fuse([View(np.array([0.27, -0.2, 1.0]), top.reshape(-1, 3))], 0.4)
+    target = Detection("red", 1.0, se3.make(p=(0.27, -0.2, 0.425)), np.full(3, 0.05))
+    hand = RobotDescription.load().hand("right").parts
+    asked = Sampling(target, GraspConfig(sampler="my_samplers:CentroidSampler"), hand, surface=surface)
+    (only,) = make_sampler(asked.config.sampler).candidates(asked)
+    assert only.T_base_tcp[:2, 3] == pytest.approx([0.27, -0.2], abs=0.002)
+    assert only.apertures == (0.01, 0.07)
 
 
 def test_the_planner_is_named_by_a_parameter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
