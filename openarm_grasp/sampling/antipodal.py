@@ -41,7 +41,7 @@ _APART, _TURNED = 0.008, radians(12.0)
 _TOUCH = 0.35
 #: Weights of the score; lengths m, angles rad.
 _WEIGHTS = {"contact": 1.5, "align": 10.0, "lever": -25.0, "aside": -10.0, "tilt": -0.8, "level": -0.8, "wide": -1.5,
-            "room": 0.3, "certainty": 1.0, "balance": -1.5, "unseen": -2.0}  # fmt: skip
+            "room": 0.3, "certainty": 1.0, "balance": -2.0, "unseen": -2.0}  # fmt: skip
 #: The weight may be this far from the pads before it counts, m.
 _LEVER = 0.005
 #: A width this near to the widest begins to count, m; alignments count from here.

@@ -164,9 +164,9 @@ def _unseen(cells: Bytes, x: float, y: float, z: float, dx: float, dy: float, dz
     """How far a contact may lie farther out (d): voxels of shadow before it; 0 for one that was seen."""
     if _cell(cells, x, y, z) == SEEN:
         return 0
-    for n in range(2, 2 + _MOST_UNSEEN):
+    for n in range(2, 1 + _MOST_UNSEEN):
         if _cell(cells, x + n * dx, y + n * dy, z + n * dz) == FREE:
-            return n - 2
+            return 0 if n == 2 else n - 1  # next to an edge a voxel of shadow says nothing
     return _MOST_UNSEEN
 
 
@@ -207,7 +207,7 @@ def _touch(cells: Bytes, normals: Floats, T: Array, pad: Array, first: Array, la
         return False
     narrow = high - low
     count, sure, unseen, mean = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros((2, 3))
-    where, where_sure = np.zeros((2, 2)), np.zeros((2, 2))
+    where, where_seen, seen = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
     for a in range(_ACROSS):
         x = pad[0] + (pad[1] - pad[0]) * a / (_ACROSS - 1)
         for b in range(_ALONG):
@@ -234,8 +234,10 @@ def _touch(cells: Bytes, normals: Floats, T: Array, pad: Array, first: Array, la
                 where[side, 1] += z
                 if far == 0:
                     sure[side] += 1.0
-                    where_sure[side, 0] += x
-                    where_sure[side, 1] += z
+                if _cell(cells, cx, cy, cz) == SEEN:
+                    seen[side] += 1.0
+                    where_seen[side, 0] += x
+                    where_seen[side, 1] += z
             if touching == 2:
                 narrow = min(narrow, last[a, b] - first[a, b])
     if min(count[0], count[1]) < _LEAST_TOUCH:
@@ -244,8 +246,8 @@ def _touch(cells: Bytes, normals: Floats, T: Array, pad: Array, first: Array, la
     for side in range(2):
         along = (mean[side, 0] * T[0, 1] + mean[side, 1] * T[1, 1] + mean[side, 2] * T[2, 1]) / count[side]
         align = min(align, -along if side == 0 else along)
-        if sure[side] > 0.0:  # what was seen of the patch says where it is
-            where[side] = where_sure[side] / sure[side]
+        if seen[side] > 0.0:  # what was seen of the patch says where it is
+            where[side] = where_seen[side] / seen[side]
         else:
             where[side] = where[side] / count[side]
     # what is measured fills the voxel that it is in, but pixels at the very edge of an object are lost

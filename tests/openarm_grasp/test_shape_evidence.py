@@ -8,10 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.shapes import Cluster, ClusterFrame, judge_gone, judge_rests
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
+from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.planning.candidates import GraspCandidate
+from openarm_grasp.requests.task import Grasp
 
 HELD = HeldConfig()
 STOOD = Cluster(np.array([0.27, -0.2, 0.42]), 0.44, 0.12, 800)
@@ -120,3 +125,21 @@ def test_a_cluster_is_measured_without_its_few_flying_points():
     assert cluster.extent == pytest.approx(0.1, abs=0.006)
     with pytest.raises(OpenArmError, match="without finite points"):
         Cluster.of(np.full((4, 3), np.nan))
+
+
+def test_a_grasp_judges_its_hand_by_its_interval_and_by_how_far_it_had_closed():
+    T = se3.make(se3.rot_x(np.pi), (0.27, -0.2, 0.42))
+    up = np.array([0.0, 0.0, 0.12])
+    candidate = GraspCandidate("pear/cloud0/tilt0", T, up, up, 0.03, 0.0, 1.0, {}, apertures=(0.022, 0.041))
+    target = Detection("pear", 0.9, se3.make(p=(0.27, -0.2, 0.42)), np.array([0.06, 0.09, 0.04]), measured=False)
+    grasp = Grasp("right", Sighting(target, (), 0), candidate, ())
+
+    def gap(value):
+        return Evidence(value, candidate.width, -30.0, 0.0)
+
+    assert grasp.judge(gap(0.04), HELD).ok
+    closed = replace(grasp, closed=0.036)
+    assert closed.judge(gap(0.037), HELD, was_held=True).ok
+    assert closed.judge(gap(0.040), HELD, was_held=True).code is Code.GRASP_LOST
+    box = replace(grasp, candidate=replace(candidate, apertures=None))
+    assert box.judge(gap(0.04), HELD).code is Code.HAND_COLLISION
