@@ -47,6 +47,7 @@ from openarm_motion.service.robot import Outcome
 from openarm_motion.timing.trajectory import Motion
 from openarm_octomap.grid import DepthScan
 from openarm_octomap.mapper import Frame as MapFrame
+from openarm_perception.detection.clouds import labelled_cloud
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer
@@ -310,7 +311,8 @@ class SimRobot:
             )
         except OpenArmError:
             return None  # as the detector: the frame is skipped, the next may do
-        return Frame(stamp_ns, perceived.boxes)
+        cloud = labelled_cloud(seen, perceived.boxes, DepthLimits(near=camera.near, far=camera.far))
+        return Frame(stamp_ns, perceived.boxes, cloud.moved(T_base_camera))
 
     def _watch(self, name: str) -> CameraWatch:
         camera = self.cameras[name]

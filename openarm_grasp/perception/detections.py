@@ -17,20 +17,27 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_common.wanted import describe, select
 from openarm_grasp.config import DetectConfig
 
 #: An object that is chosen by its position is no farther from it than this, m.
 SAME_PLACE = 0.05
+#: Clouds of so many frames are enough.
+_CLOUDS = 3
 
 
 @dataclass(frozen=True)
 class Frame:
-    """All detections of one image; `t_ns` is the image stamp."""
+    """All detections of one image; `t_ns` is the image stamp.
+
+    `cloud` has the points of the image, labelled by detection, where they are known.
+    """
 
     t_ns: int
     detections: tuple[Detection, ...]
+    cloud: LabelledCloud | None = None
 
 
 @dataclass(frozen=True)
@@ -41,11 +48,13 @@ class Sighting:
         target: The averaged detection.
         others: Every other object, newest sight of each.
         t_ns: Stamp of the newest frame.
+        clouds: Of the newest frames that show the target, with its points labelled 1 and all others 0.
     """
 
     target: Detection
     others: tuple[Detection, ...]
     t_ns: int
+    clouds: tuple[LabelledCloud, ...] = ()
 
 
 def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Frame, ...]:
@@ -59,7 +68,7 @@ def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Fr
     for frame in frames:
         T = lookup(frame.t_ns)
         found = (replace(d, T_base_object=T @ d.T_base_object) for d in frame.detections)
-        moved.append(Frame(frame.t_ns, tuple(found)))
+        moved.append(replace(frame, detections=tuple(found)))
     return tuple(moved)
 
 
@@ -147,10 +156,16 @@ def find(
     if not anchor.measured:
         raise _not_measured(anchor)
     track: list[Detection] = []
+    clouds: list[LabelledCloud] = []
     for frame in frames:
         fit = [d for d in frame.detections if d.label == anchor.label and d.measured]
         near = [d for d in fit if _distance(d, anchor) <= limits.match_radius]
-        track += [min(near, key=lambda d: _distance(d, anchor))] if near else []
+        if not near:
+            continue
+        track.append(min(near, key=lambda d: _distance(d, anchor)))
+        if frame.cloud is not None:
+            number = frame.detections.index(track[-1]) + 1
+            clouds.append(replace(frame.cloud, labels=(frame.cloud.labels == number).astype(np.uint32)))
     # A detector may miss a thing in one frame; in most of them it must be in its place.
     if 3 * len(track) < 2 * len(frames):
         blurred = [f for f in frames if any(not d.measured and _same_thing(d, anchor) for d in f.detections)]
@@ -169,7 +184,8 @@ def find(
             f" {limits.agree_within * 1e3:.1f} mm; is it at rest?",
         )
     target = average(track)
-    return Sighting(target, _others(frames, target, limits.match_radius), frames[-1].t_ns)
+    others = _others(frames, target, limits.match_radius)
+    return Sighting(target, others, frames[-1].t_ns, tuple(clouds[-_CLOUDS:]))
 
 
 def _same(frames: Sequence[Frame], before: Sighting) -> Detection:

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from action_msgs.msg import GoalStatus
 from rclpy.subscription import Subscription
 from rclpy.task import Future
+from sensor_msgs.msg import PointCloud2
 from unique_identifier_msgs.msg import UUID
 from vision_msgs.msg import Detection3DArray
 
@@ -23,7 +25,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import ActionClient, check_alive
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.detections import detections_from_msg
-from openarm_common.ros.node import BaseNode, reliable
+from openarm_common.ros.labelled_clouds import labelled_cloud_from_msg
+from openarm_common.ros.node import QOS_SENSOR, BaseNode, reliable
 from openarm_common.ros.tf import RobotStateListener
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import Silence
@@ -33,12 +36,16 @@ from openarm_grasp.ros.pad_listener import Pads
 
 #: What the detector of the camera over the table finds.
 DETECTIONS = "/detections_3d"
+#: The points of the same, in the same namespace.
+POINTS = "detection_points"
 _TICK_S = 0.025
 #: A longer pause between two ticks is this process being starved, not the robot being silent.
 _STARVED_S = 0.2
 _STOP_LIMIT_S = 2.0
 #: An action server that is not in the graph at so many checks in a row is gone (1.5 s; a lost robot is noticed sooner).
 _GONE = 60
+#: Clouds that wait for their detections.
+_CLOUDS = 8
 
 
 class GraphClients:
@@ -54,7 +61,9 @@ class GraphClients:
         self._config = config
         self.robot = RobotStateListener(node, node.description, joints=False, held_topic="/motion/attached_objects")
         self.pads = Pads(node)
-        self._detections: dict[str, Subscription] = {}
+        self._subscriptions: dict[str, tuple[Subscription, ...]] = {}
+        #: Newest clouds of the topic by stamp.
+        self._clouds: dict[int, PointCloud2] = {}
         self._topic = DETECTIONS
         self._frames: list[Frame] = []
         self._frame_id = node.description.base
@@ -233,13 +242,17 @@ class GraphClients:
                 raise
             seen = f"{len(self._frames)} of {count} frames came from {topic} within {limit:g} s"
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
-        return Frames(tuple(self._frames[-count:]), self._frame_id)
+        return Frames(tuple(self._with_cloud(frame) for frame in self._frames[-count:]), self._frame_id)
 
     def listen(self, topic: str) -> None:
         """Let a detector begin: the first frame comes up to 1.5 s later, as its camera rests without a subscriber."""
-        if topic not in self._detections:
-            self._detections[topic] = self._node.create_subscription(
-                Detection3DArray, topic, partial(self._on_detections, topic), reliable(5)
+        if topic not in self._subscriptions:
+            points = topic.rpartition("/")[0] + "/" + POINTS
+            self._subscriptions[topic] = (
+                self._node.create_subscription(
+                    Detection3DArray, topic, partial(self._on_detections, topic), reliable(5)
+                ),
+                self._node.create_subscription(PointCloud2, points, partial(self._on_cloud, topic), QOS_SENSOR),
             )
 
     def _on_detections(self, topic: str, message: Detection3DArray) -> None:
@@ -254,7 +267,27 @@ class GraphClients:
             return
         self._frame_id = message.header.frame_id
 
+    def _on_cloud(self, topic: str, message: PointCloud2) -> None:
+        if topic == self._topic:
+            self._clouds[stamp_to_ns(message.header.stamp)] = message
+            while len(self._clouds) > _CLOUDS:
+                del self._clouds[next(iter(self._clouds))]
+
+    def _with_cloud(self, frame: Frame) -> Frame:
+        """Return a frame with its points in the base frame, where they came and the pose of their camera is known."""
+        message = self._clouds.get(frame.t_ns)
+        if message is None:
+            return frame
+        try:
+            T = self.robot.buffer.lookup(self._node.description.base, message.header.frame_id, frame.t_ns)
+            return replace(frame, cloud=labelled_cloud_from_msg(message).moved(T))
+        except OpenArmError as error:
+            self._node.get_logger().warning(f"dropped the points of a frame: {error.message}")
+            return frame
+
     def stop_observing(self) -> None:
         """Leave all detections, so that the detectors may rest."""
-        while self._detections:
-            self._node.destroy_subscription(self._detections.popitem()[1])
+        while self._subscriptions:
+            for subscription in self._subscriptions.popitem()[1]:
+                self._node.destroy_subscription(subscription)
+        self._clouds.clear()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from openarm_interfaces.srv import MeasureTable
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from vision_msgs.msg import Detection2DArray, Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
@@ -29,9 +29,11 @@ from openarm_common.ros.answers import answering
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import array_to_image, depth_image, intrinsics_from_info, rgb_image
 from openarm_common.ros.detections import detections_to_msg
+from openarm_common.ros.labelled_clouds import labelled_cloud_to_msg
 from openarm_common.ros.node import QOS_LATCHED, QOS_SENSOR, BaseNode, reliable, run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_perception.config import DetectNodeConfig
+from openarm_perception.detection.clouds import labelled_cloud
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.detection.draw import annotate
 from openarm_perception.detection.localize import Localizer
@@ -102,6 +104,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._objects = self.create_publisher(Detection3DArray, "/detections_3d", reliable(5))
         self._picture = self.create_publisher(Image, "/detection_image", QOS_SENSOR)
         self._mask = self.create_publisher(Image, "/detection_mask", QOS_SENSOR)
+        self._clouds = self.create_publisher(PointCloud2, "/detection_points", QOS_SENSOR)
         self._markers = self.create_publisher(MarkerArray, "/detection_markers", reliable(5))
         self.create_timer(0.1, self._follow_demand, clock=self.steady_clock)
         self.diagnose(True, "idle: no subscribers", **self._counts)
@@ -167,7 +170,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
 
     def _follow_demand(self) -> None:
         self._stream.poll()
-        outputs = (self._boxes, self._objects, self._picture, self._mask, self._markers)
+        outputs = (self._boxes, self._objects, self._picture, self._mask, self._clouds, self._markers)
         asked = time.monotonic() < self._asked_until
         wanted = asked or any(output.get_subscription_count() for output in outputs)
         if wanted != self._stream.listening:
@@ -197,6 +200,9 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         except OpenArmError as error:
             self._refuse(error)
             return
+        if self._clouds.get_subscription_count():  # first, so that whoever waits for the objects has them
+            cloud = labelled_cloud(self._newest, perceived.boxes, self._localizer.limits)
+            self._clouds.publish(labelled_cloud_to_msg(cloud, self._optical_frame, frame.t_ns))
         self._publish(frame.t_ns, rgb, perceived, (time.perf_counter() - started) * 1e3)
 
     def _find_robot(self, depth: DepthImage, intrinsics: Intrinsics, posture: Posture) -> Mask | None:

@@ -26,6 +26,7 @@ from openarm_common.ros.convert import (
     ns_to_stamp,
     points_from_cloud,
 )
+from openarm_common.ros.labelled_clouds import labelled_cloud_from_msg
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, reliable
 from openarm_perception.ros.cloud_node import CloudNode
 from openarm_perception.ros.detector_node import DetectNode
@@ -117,8 +118,9 @@ def test_what_motion_holds_is_no_object_on_the_table(ros) -> None:
     """Reported until motion says that it is held; then found in the image alone, counted, and out of the mask."""
     bench = detector(ros)
     bench.pump(lambda: bench.got and bench.got[-1].detections, "the box is taken for an object")
-    in_image, masks = [], []
+    in_image, masks, clouds = [], [], []
     keep = (
+        ros.node.create_subscription(PointCloud2, "/detection_points", clouds.append, QOS_SENSOR),
         ros.node.create_subscription(Detection2DArray, "/detections_2d", in_image.append, reliable(10)),
         ros.node.create_subscription(Image, "/detection_mask", masks.append, QOS_SENSOR),
     )
@@ -127,6 +129,10 @@ def test_what_motion_holds_is_no_object_on_the_table(ros) -> None:
     assert (masks[-1].encoding, mask.shape) == ("mono8", (480, 640))
     assert (mask[PATCH] == 1).all()
     assert np.count_nonzero(mask) == (2 * HALF) ** 2
+    bench.pump(lambda: clouds and clouds[-1].width, "its points")
+    cloud = labelled_cloud_from_msg(clouds[-1])
+    assert clouds[-1].header.frame_id == FRAME
+    assert np.count_nonzero(cloud.labels == 1) > 0.8 * (2 * HALF) ** 2  # without its border, which may float
     bench.hold()
     bench.pump(lambda: not bench.got[-1].detections and bench.said.get("removed/held/right/red"), "it is held")
     assert int(bench.said["removed/held/right/red"]) == (2 * HALF) ** 2
@@ -135,7 +141,7 @@ def test_what_motion_holds_is_no_object_on_the_table(ros) -> None:
     bench.pump(lambda: len(masks) > count + 1 and in_image, "a mask of what is held")
     assert not image_to_array(masks[-1]).any()
     assert len(in_image[-1].detections) == 1
-    assert len(keep) == 2
+    assert len(keep) == 3
 
 
 def test_without_joint_states_objects_are_seen_and_the_lack_is_named(ros) -> None:

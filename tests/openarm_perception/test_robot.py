@@ -16,7 +16,9 @@ from openarm_common import se3
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.robot.held import HeldBox
 from openarm_common.scene.scene import load_scene, random_scene
+from openarm_perception.detection.clouds import labelled_cloud
 from openarm_perception.detection.robot import CloudRobotConfig, RobotConfig, RobotFinder
+from openarm_perception.geometry.depth import DepthLimits, View
 from openarm_perception.ros.convert import mask_image
 
 TCP = "openarm_right_hand_tcp"
@@ -156,3 +158,25 @@ def test_clouds_keep_the_robot_unless_asked() -> None:
     assert RobotConfig().enabled
     assert not CloudRobotConfig().enabled
     assert RobotConfig().padding == CloudRobotConfig().padding == 0.005
+
+
+def test_the_points_of_objects_are_on_them_and_what_is_around_is_none_of_theirs(studio) -> None:
+    """From the demo scene: points of an object lie in its box, those with no label on the table or on another one."""
+    scene = load_scene("demo")
+    look = Look(studio, scene, studio.home())
+    perceived = look.perceive(look.robot)
+    view = View(look.rgb, look.depth, look.K, look.T, look.robot)
+    cloud = labelled_cloud(view, perceived.boxes, DepthLimits()).moved(look.T)
+    assert np.allclose(cloud.camera, look.T[:3, 3])
+    assert set(cloud.labels.tolist()) == set(range(len(perceived.boxes) + 1))
+    for number, place in enumerate(perceived.boxes, start=1):
+        points = cloud.points[cloud.labels == number]
+        inside = np.abs(se3.apply(se3.inverse(place.T_base_object), points)) <= place.size / 2.0 + 0.004
+        assert len(points) > 100
+        assert inside.all(axis=1).mean() > 0.99
+    rest = cloud.points[cloud.labels == 0]
+    assert (rest[:, 2] < scene.table.top_z + 0.004).mean() > 0.95  # the table, and the floor beyond its edge
+    table = rest[np.abs(rest[:, 2] - scene.table.top_z) < 0.004]
+    assert len(table) > 1000
+    near = [np.linalg.norm(table[:, :2] - place.p_base[:2], axis=1) for place in perceived.boxes]
+    assert np.min(near, axis=0).max() < 0.40
