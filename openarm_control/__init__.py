@@ -4,8 +4,8 @@
 Example:
     >>> from openarm_common import RobotDescription
     >>> from openarm_control import ServoConfig, arm_loads
-    >>> loads = arm_loads(RobotDescription.load())
-    >>> ServoConfig().model(loads["left"]).soft
+    >>> robot = RobotDescription.load()
+    >>> ServoConfig().model(robot, arm_loads(robot)["left"]).soft
     True
 """
 

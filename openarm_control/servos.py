@@ -8,56 +8,84 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field, field_validator
 
 from openarm_common.config import Config
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.motors import Gains, Numbers, Range
 from openarm_common.robot.servo_store import ServoStore
 from openarm_common.robot.servos import ArmLoad, ServoModel
 
-Positive = Annotated[float, Field(gt=0.0)]
-Seven = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive]
-Range = tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]]
-
 
 class ServoConfig(Config):
-    """Motors of the arms, by default as their owners have them: nothing carries the weight."""
+    """Motors of the arms, by default as `robot.yaml` says that owners of the robot have them."""
 
-    # gains of openarm_ros2 since May 2026
-    stiffness: Seven = Field(default=(70, 70, 70, 60, 10, 10, 10), description="position gains, N m/rad")
-    damping: Seven = Field(default=(2.75, 2.5, 2.0, 2.0, 0.7, 0.6, 0.5), description="velocity gains, N m s/rad")
-    armature: Seven = Field(
-        default=(0.0081, 0.0081, 0.16, 0.16, 0.01, 0.01, 0.01), description="inertia of rotor and gear, kg m2"
+    stiffness: Numbers = Field(default=(), description="position gains, N m/rad; empty: the robot's")
+    damping: Numbers = Field(default=(), description="velocity gains, N m s/rad; empty: the robot's")
+    armature: Numbers = Field(default=(), description="inertia of rotor and gear, kg m2; empty: the robot's")
+    stiff: bool = Field(default=False, description="gains that are not given are those of the robot's stiff servos")
+    gravity_compensation: Annotated[float, Field(ge=0.0, le=1.0)] | None = Field(
+        default=None, description="share of the arms' weight that the motors carry by themselves; none: the robot's"
     )
-    gravity_compensation: float = Field(
-        default=0.0, ge=0.0, le=1.0, description="share of the arms' weight that the motors carry by themselves"
-    )
-    friction: Range = Field(
-        default=(0.2, 0.5), description="range of the dry friction of a joint, N m; 0, 0: as described"
+    friction: Range | None = Field(
+        default=None, description="range of the dry friction of a joint, N m; 0, 0: as described; none: the robot's"
     )
     # one to five cycles of a CAN loop at 500 Hz
     latency: Range = Field(default=(0.002, 0.010), description="range of the time until a command takes effect, s")
 
     @field_validator("friction", "latency")
     @classmethod
-    def _in_order(cls, value: Range) -> Range:
-        if value[0] > value[1]:
+    def _in_order(cls, value: Range | None) -> Range | None:
+        if value is not None and value[0] > value[1]:
             raise ValueError("expected the lower end first")
         return value
 
-    def model(self, load: ArmLoad) -> ServoModel:
-        """Return the servos of an arm, as a client knows them that has not identified them."""
+    def of(self, robot: RobotDescription) -> Self:
+        """Return it with what it leaves to the robot.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when a row does not fit the arms, or `robot.yaml` does not say the motors.
+        """
+        said = robot.motors
+        left = None in (self.gravity_compensation, self.friction)
+        if said is None and (left or not (self.stiffness and self.damping and self.armature)):
+            text = f"robot.yaml of {robot.name!r} lacks `motors`, which says what drives the arms"
+            raise OpenArmError(Code.CONFIG_INVALID, text)
+        gains = Gains(stiffness=(1.0,), damping=(1.0,)) if said is None else said.stiff if self.stiff else said.gains
+        rows = {
+            "stiffness": self.stiffness or gains.stiffness,
+            "damping": self.damping or gains.damping,
+            "armature": self.armature or getattr(said, "armature", ()),
+        }
+        for name, arm in robot.arms.items():
+            for key, row in rows.items():
+                if len(row) != len(arm.joints):
+                    text = f"{key} has {len(row)} numbers, arm {name!r} has {len(arm.joints)} joints"
+                    raise OpenArmError(Code.CONFIG_INVALID, text)
+        if said is None:
+            return self
+        carried, friction = self.gravity_compensation, self.friction
+        whole = {
+            "gravity_compensation": said.gravity_compensation if carried is None else carried,
+            "friction": said.friction if friction is None else friction,
+        }
+        return self.model_copy(update=rows | whole)
+
+    def model(self, robot: RobotDescription, load: ArmLoad) -> ServoModel:
+        """Return the servos of an arm of a robot, as a client knows them that has not identified them."""
+        known = self.of(robot)
         return ServoModel(
-            stiffness=np.array(self.stiffness),
-            damping=np.array(self.damping) + load.damping,
-            friction=np.maximum(load.friction, np.mean(self.friction)),
-            armature=np.array(self.armature),
-            latency_s=np.full(len(self.stiffness), float(np.mean(self.latency))),
-            weight=1.0 - self.gravity_compensation,
+            stiffness=np.array(known.stiffness),
+            damping=np.array(known.damping) + load.damping,
+            friction=np.maximum(load.friction, np.mean(known.friction or 0.0)),
+            armature=np.array(known.armature),
+            latency_s=np.full(len(known.stiffness), float(np.mean(known.latency))),
+            weight=1.0 - (known.gravity_compensation or 0.0),
         )
 
 

@@ -6,33 +6,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from openarm_common.config import Config, RunTimeField
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.motors import JointMotion
+from openarm_common.types import Array
 from openarm_motion.collision.exact import Clearance
-
-_SEVEN_V = (2.0, 2.0, 2.5, 2.5, 3.0, 3.0, 3.0)
-_SEVEN_A = (6.0, 6.0, 8.0, 8.0, 12.0, 12.0, 12.0)
-_SEVEN_J = (60.0, 60.0, 80.0, 80.0, 120.0, 120.0, 120.0)
+from openarm_motion.timing.trajectory import JointLimits
 
 
 class LimitsConfig(Config):
     """What the joints of an arm may do, from the shoulder to the wrist; plans use these times the velocity scale."""
 
-    velocity: tuple[float, ...] = Field(default=_SEVEN_V, description="rad/s, one number a joint")
-    acceleration: tuple[float, ...] = Field(default=_SEVEN_A, description="rad/s2, one number a joint")
-    jerk: tuple[float, ...] = Field(default=_SEVEN_J, description="rad/s3, one number a joint")
+    velocity: tuple[float, ...] = Field(default=(), description="rad/s, one number a joint; empty: the robot's")
+    acceleration: tuple[float, ...] = Field(default=(), description="rad/s2, one number a joint; empty: the robot's")
+    jerk: tuple[float, ...] = Field(default=(), description="rad/s3, one number a joint; empty: the robot's")
     straight_speed: float = Field(default=0.25, gt=0.0, le=2.0, description="tool on straight lines at scale 1, m/s")
     default_scale: float = Field(default=0.5, gt=0.0, le=1.0, description="velocity scale of a request that has none")
 
     @model_validator(mode="after")
     def _positive_and_alike(self) -> LimitsConfig:
-        sizes = {len(self.velocity), len(self.acceleration), len(self.jerk)}
-        if len(sizes) != 1 or min(self.velocity + self.acceleration + self.jerk, default=0.0) <= 0.0:
+        sizes = {len(row) for row in (self.velocity, self.acceleration, self.jerk) if row}
+        if len(sizes) > 1 or min(self.velocity + self.acceleration + self.jerk, default=1.0) <= 0.0:
             raise ValueError("velocity, acceleration and jerk need one number > 0 for each joint")
         return self
+
+    def of(self, robot: JointMotion | None, arm: str, names: Sequence[str]) -> JointLimits:
+        """Return the limits of an arm.
+
+        Args:
+            robot: What its folder says; None: nothing.
+            arm: Its name.
+            names: Its joints.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, naming the row that does not fit the joints.
+        """
+        rows: list[Array] = []
+        for key in ("velocity", "acceleration", "jerk"):
+            row = getattr(self, key) or getattr(robot, key, ())
+            if len(row) != len(names):
+                joints = f"arm {arm!r} has {len(names)} joints: {', '.join(names)}"
+                raise OpenArmError(Code.CONFIG_INVALID, f"limits.{key} has {len(row)} numbers, {joints}")
+            rows.append(np.array(row, dtype=np.float64))
+        return JointLimits(*rows)
 
 
 class StraightClearance(Clearance):

@@ -8,6 +8,7 @@ activated.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,7 +20,6 @@ from openarm_control.controller import JointController
 from openarm_control.follower import End
 from openarm_control.joints import JointReadout
 from openarm_control.trajectory import JointGroup, Trajectory
-from openarm_sim_bridge.world.hardware import MOTOR_RANGE
 from openarm_sim_bridge.world.world import World
 
 #: Time in which activation takes all joints to zero on a straight line, s.
@@ -43,10 +43,11 @@ class PositionController:
     Args:
         names: Its joints.
         position: (k,) that it commands at first.
+        limit: Of the motors' position commands, +-rad.
     """
 
-    def __init__(self, names: Sequence[str], position: Array) -> None:
-        whole, free = np.full(len(names), MOTOR_RANGE), np.full(len(names), np.inf)
+    def __init__(self, names: Sequence[str], position: Array, limit: float = math.inf) -> None:
+        whole, free = np.full(len(names), limit), np.full(len(names), np.inf)
         #: Its joints; their limits are those of the motors' position commands.
         self.group = JointGroup(tuple(names), -whole, whole, free)
         self.command: Array = position.copy()
@@ -109,9 +110,11 @@ class OpenArmRos2(JointController):
         self._at: dict[str, Ints] = {
             name: np.array([joint_names.index(joint) for joint in joints]) for name, joints in groups.items()
         }
+        bus = description.motors.bus if description.motors is not None else None
+        limit = math.inf if bus is None else bus.position
         #: By name.
         self.controllers = {
-            name: PositionController(joints, state.position[self._at[name]]) for name, joints in groups.items()
+            name: PositionController(joints, state.position[self._at[name]], limit) for name, joints in groups.items()
         }
         self._fingers = np.concatenate([self._at[f"{side}_gripper_controller"] for side in description.arm_names])
         self._targets = state.position.copy()

@@ -24,6 +24,7 @@ from openarm_common.resources import is_file
 from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, robot_name
 from openarm_common.robot.hand import Hand
 from openarm_common.robot.meshes import take_meshes
+from openarm_common.robot.motors import JointMotion, Motors
 from openarm_common.robot.srdf import Semantics, parse_srdf
 from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf
 from openarm_common.robot.xml_text import fault, parse_root
@@ -48,6 +49,8 @@ class RobotDescription:
         arms: By name.
         hands: By arm.
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
+        motion: What plans ask of the joints of an arm, where its folder says it.
+        motors: Of each arm, where its folder says them.
     """
 
     urdf: str
@@ -62,6 +65,8 @@ class RobotDescription:
     arms: Mapping[str, ArmParts] = field(default_factory=dict[str, ArmParts])
     hands: Mapping[str, Hand] = field(default_factory=dict[str, Hand])
     mirror: tuple[float, ...] = ()
+    motion: JointMotion | None = None
+    motors: Motors | None = None
 
     @classmethod
     def load(cls, name: str = "") -> RobotDescription:
@@ -148,7 +153,8 @@ class RobotDescription:
         """Return the robot with the name of its folder and what `robot.yaml` says."""
         hand, arms = parts.hand, parts.arms
         hands = {key: Hand(arm.finger_joint, arm.finger_sign, hand) for key, arm in arms.items()} if hand else {}
-        return replace(self, name=name, base=parts.base, arms=arms, hands=hands, mirror=parts.mirror)
+        said = {"mirror": parts.mirror, "motion": parts.motion, "motors": parts.motors}
+        return replace(self, name=name, base=parts.base, arms=arms, hands=hands, **said)
 
     @property
     def arm_names(self) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_common.robot.hand import HandParts
+from openarm_common.robot.motors import JointMotion, Motors
 from openarm_common.robot.work import Work
 
 P = ParamSpec("P")
@@ -64,6 +65,8 @@ class RobotFolder(Config):
         cameras: YAML of the cameras; "": it has none.
         base: Base frame: x forward, y left, z up, on the floor.
         hand: What the fingers of each arm can do; None: nothing is known of them.
+        motion: What plans ask of the joints of an arm; None: parameters of the motion node say it.
+        motors: Of each arm; None: it is not simulated.
         arms: By name; the group of each in the SRDF is `NAME_arm`.
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
         work: Where it works; None: it has no table, and no scenes.
@@ -75,6 +78,8 @@ class RobotFolder(Config):
     cameras: str = ""
     base: str
     hand: HandParts | None = None
+    motion: JointMotion | None = None
+    motors: Motors | None = None
     arms: Mapping[str, ArmParts] = Field(min_length=1)
     mirror: tuple[float, ...] = ()
     work: Work | None = None
@@ -92,6 +97,12 @@ class RobotFolder(Config):
             if self.mirror and len(self.mirror) != len(arm.joints):
                 text = f"mirror has {len(self.mirror)} signs, arm {name} has {len(arm.joints)} joints"
                 raise ValueError(text)
+            for part in ("motion", "motors"):
+                rows = getattr(self, part).rows() if getattr(self, part) else ()
+                for row, numbers in rows:
+                    if len(numbers) != len(arm.joints):
+                        text = f"{part}.{row} has {len(numbers)} numbers, arm {name} has {len(arm.joints)} joints"
+                        raise ValueError(text)
         return self
 
 

@@ -32,7 +32,7 @@ class ArmControl(ControlNode[ArmControlConfig]):
         super().__init__("arm_control", ArmControlConfig, **kwargs)
         config, description = self.config, self.description
         known: dict[str, ServoModel] = {
-            side: config.servos.model(load) for side, load in arm_loads(description).items()
+            side: config.servos.model(description, load) for side, load in arm_loads(description).items()
         }
         seed = None if config.dynamics_seed < 0 else config.dynamics_seed
         servos = KnownServos(known, config.calibrations, seed, self.get_logger().warning)

@@ -98,16 +98,17 @@ def with_servos(task: Task, options: CampaignOptions, folder: Path) -> tuple[Tas
 
     Args:
         task: The task.
-        options: Of the campaign; None for the servos where they are not identified.
+        options: Of the campaign; None for the servos where they are not identified, or need not be: they carry the arm.
         folder: Of identifications; those that it lacks are made.
     """
     seed = options.dynamics_seeds[task.seed % len(options.dynamics_seeds)]
     task = replace(task, dynamics_seed=seed)
-    if not options.identify:
+    robot = RobotDescription.load()
+    hardware = suite_config(options.graph_parameters()).bridge.hardware.of_seed(seed)
+    if not options.identify or hardware.of(robot).gravity_compensation == 1.0:
         return task, None
-    store, arms = ServoStore(folder / str(seed)), RobotDescription.load().arm_names
+    store, arms = ServoStore(folder / str(seed)), robot.arm_names
     if any(store.find(arm) is None for arm in arms):
-        hardware = suite_config(options.graph_parameters()).bridge.hardware.of_seed(seed)
         for side, found in DynamicsBench(hardware).identified().items():
             store.save(found.record(side, seed))
     return task, {arm: store.load(arm).model() for arm in arms}

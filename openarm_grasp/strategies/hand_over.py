@@ -56,13 +56,13 @@ class HandOver:
 
 
 async def hand_over(task: Task) -> GraspOutcome | None:
-    """From hand to hand by way of the middle, when an arm can pick the object and only the other reaches its place.
+    """From hand to hand by way of the middle, when an arm can pick the object and only another reaches its place.
 
     When the taker is refused after all, again from where the object then is.
     """
     asked, most = task.request, task.context.config.hand_over.rounds
     known = task.outcome
-    if known is None or asked.place is None or not task.findings.place_refused:
+    if known is None or asked.place is None or not task.findings.place_refused or len(task.context.shoulders) < 2:
         return None
     refused = None
     for number in range(1, most + 1):

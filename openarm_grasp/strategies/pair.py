@@ -159,7 +159,9 @@ async def in_turn(pair: Pair) -> PairOutcome:
 # --- which arm
 async def _arms_for_both(pair: Pair) -> tuple[tuple[str, ...], str]:
     """Observe once, and give an arm to each object; none, with the reason, when they go one after the other."""
-    requests = pair.requests
+    requests, shoulders = pair.requests, pair.session.context.shoulders
+    if len(shoulders) < 2:
+        return (), "the robot has one arm: one after the other"
     places = [request.place for request in requests if request.place is not None]
     if len(places) == 2 and float(np.hypot(*(np.subtract(places[0][:2], places[1][:2])))) < _APART:
         return (), "the places are close to each other: one after the other"
@@ -171,7 +173,6 @@ async def _arms_for_both(pair: Pair) -> tuple[tuple[str, ...], str]:
         if error.code is Code.CANCELLED:
             pair.task(0, pair.robot)  # a deadline ends work as a cancel does; here it gets its own name
         raise
-    shoulders = pair.session.context.shoulders
     faults: list[str] = []
 
     def crossing(arms: tuple[str, str]) -> float:

@@ -224,15 +224,7 @@ class Arm(PlanningGroup):
         self.static: tuple[Box, ...] = tuple(static)
         self._planner: Planner = planner or make_planner(config.planning.planner)
         self.direct = planner is None and config.planning.planner == "fast"  # another one is asked for every path
-        limits = config.limits
-        if len(limits.velocity) != self.kinematics.n:
-            raise OpenArmError(
-                Code.CONFIG_INVALID,
-                f"limits.velocity has {len(limits.velocity)} numbers, arm {name!r} has {self.kinematics.n} joints:"
-                f" {', '.join(self.kinematics.names)}",
-            )
-        values = (limits.velocity, limits.acceleration, limits.jerk)
-        self._limits = JointLimits(*(np.array(value, dtype=np.float64) for value in values))
+        self._limits = config.limits.of(description.motion, name, self.names)
 
     def start_state(
         self,

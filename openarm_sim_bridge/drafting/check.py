@@ -96,7 +96,8 @@ def _group_faults(robot: RobotDescription) -> Iterator[str]:
 
 
 def _posture_faults(robot: RobotDescription, contacts: LinkContacts) -> Iterator[str]:
-    others = robot.semantics.states.get(("both_arms", "home"), {})
+    homes = [robot.semantics.states.get((f"{arm}_arm", "home"), {}) for arm in robot.arms]
+    others = {joint: value for home in homes for joint, value in home.items()}
     for (group, name), state in robot.semantics.states.items():
         for joint, value in state.items():
             lower, upper = robot.joint(joint).lower, robot.joint(joint).upper

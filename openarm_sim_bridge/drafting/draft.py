@@ -67,7 +67,7 @@ def draft_folder(
     folder.mkdir(parents=True, exist_ok=True)
     urdf = folder / f"{folder.name}.urdf"
     if source.suffix == ".xml":
-        draft = UrdfDraft(folder.name, compiled(source), wanted)
+        draft = UrdfDraft(folder.name, compiled(source, wanted), wanted)
         draft.meshes.write(folder, wanted.triangles, wanted.detail)
         urdf.write_text(draft.text().replace("\n", f"\n{_LICENCE}", 1), encoding="utf-8")
     else:

@@ -9,7 +9,7 @@ from typing import Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from openarm_common.config import Config
+from openarm_common.config import Config, Interval
 
 Vector = tuple[float, float, float]
 ValueT = TypeVar("ValueT")
@@ -55,15 +55,57 @@ class FrameEdit(Config):
         return self
 
 
+class AttachEdit(Config):
+    """Another MJCF, such as a hand, on a body of the robot.
+
+    Attributes:
+        file: Path, from the folder of the robot's MJCF.
+        body: That carries it.
+        prefix: Of its names.
+        xyz: Of its origin, in the frame of the body.
+        rpy: Of its axes.
+    """
+
+    file: str
+    body: str
+    prefix: str = ""
+    xyz: Vector = (0.0, 0.0, 0.0)
+    rpy: Vector = (0.0, 0.0, 0.0)
+
+
+class MimicEdit(Config):
+    """The position of a joint follows another: `multiplier` times it, plus `offset`.
+
+    Attributes:
+        joint: That it follows.
+        multiplier: rad/rad, or m/m.
+        offset: rad, or m.
+    """
+
+    joint: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
 class Edits(Config):
-    """What the file says. Keys of `velocity`, `damping`, `detail` are patterns: `*` is any text.
+    """What the file says. Keys of `velocity`, `effort`, `damping`, `fixed`, `detail` are patterns: `*` is any text.
+
+    Names are those of the robot, with its prefix.
 
     Attributes:
         base: Link that has what the MJCF fixes to the world.
+        prefix: Of all bodies, joints, geoms and sites, for names that no other robot has.
+        stand: Where the MJCF stands in the base frame, whose origin is on the floor.
+        turn: How it is turned there about z, rad.
+        attach: Further MJCFs.
+        mimic: Joints that follow another, where the MJCF has a linkage or a tendon in place of a coupling.
+        fixed: Joints that do not move, of linkages that a tree can't have.
         velocity: Limits by joint, rad/s or m/s; an MJCF has none.
+        effort: Limits by joint in place of the MJCF's, N m or N.
+        range: The same of positions, such as those that cables leave, rad or m.
         damping: By joint in place of the MJCF's, N m s/rad or N s/m.
         boxes: All shapes of a link, seen and touched.
-        replace: A collision shape by its name.
+        replace: A collision shape by its name; none: it is left out.
         frames: Links in addition.
         materials: rgba of those of boxes.
         triangles: Of all visual meshes together, at most.
@@ -71,10 +113,18 @@ class Edits(Config):
     """
 
     base: str = "base_link"
+    prefix: str = ""
+    stand: Vector = (0.0, 0.0, 0.0)
+    turn: float = 0.0
+    attach: tuple[AttachEdit, ...] = ()
+    mimic: Mapping[str, MimicEdit] = Field(default_factory=dict)
+    fixed: tuple[str, ...] = ()
+    effort: Mapping[str, float] = Field(default_factory=dict)
+    range: Mapping[str, Interval] = Field(default_factory=dict)
     velocity: Mapping[str, float] = Field(default_factory=dict)
     damping: Mapping[str, float] = Field(default_factory=dict)
     boxes: Mapping[str, tuple[BoxEdit, ...]] = Field(default_factory=dict)
-    replace: Mapping[str, BoxEdit] = Field(default_factory=dict)
+    replace: Mapping[str, BoxEdit | None] = Field(default_factory=dict)
     frames: Mapping[str, FrameEdit] = Field(default_factory=dict)
     materials: Mapping[str, tuple[float, float, float, float]] = Field(default_factory=dict)
     triangles: int = Field(default=60_000, ge=1000)

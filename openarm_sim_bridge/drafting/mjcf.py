@@ -9,8 +9,10 @@ settings, actuators.
 from __future__ import annotations
 
 import math
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +28,50 @@ from openarm_sim_bridge.drafting.mesh_files import MeshFiles
 
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 _ROOT = "world"
+_TAGS = ("visual", "collision")
+_UNCHANGED = Edits()
 #: A MuJoCo camera looks along -z with y up, an optical frame along z with y down.
 _OPTICAL = se3.make(se3.rot_x(math.pi))
 
 
-def compiled(path: Path) -> mujoco.MjModel:
-    """Compile an MJCF.
+def compiled(path: Path, edits: Edits = _UNCHANGED) -> mujoco.MjModel:
+    """Compile an MJCF with what is attached to it.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, with what MuJoCo says.
+        OpenArmError: CONFIG_INVALID, with what MuJoCo says, or naming a body that is not there.
     """
+    if not (edits.prefix or edits.attach or edits.turn or any(edits.stand)):
+        try:
+            return mujoco.MjModel.from_xml_path(str(path))
+        except ValueError as error:
+            raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo does not read {path}: {error}") from error
+    whole = mujoco.MjSpec()
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # options of the solver that differ are nothing a URDF has
+            turn = (math.cos(0.5 * edits.turn), 0.0, 0.0, math.sin(0.5 * edits.turn))
+            floor = whole.worldbody.add_frame(pos=edits.stand, quat=turn)
+            whole.attach(_read(path), prefix=edits.prefix, frame=floor)
+            for part in edits.attach:
+                body = whole.body(part.body)
+                if body is None:
+                    raise OpenArmError(Code.CONFIG_INVALID, f"edits.attach: no body {part.body!r} for {part.file}")
+                quat = np.roll(se3.quat_xyzw_from_matrix(se3.matrix_from_rpy(*part.rpy)), 1)
+                file = path.parent / part.file
+                whole.attach(_read(file), prefix=part.prefix, frame=body.add_frame(pos=part.xyz, quat=quat))
+            return whole.compile()
+    except ValueError as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo does not put {path} together: {error}") from error
+
+
+def _read(path: Path) -> mujoco.MjSpec:
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo does not read {path}: {error}") from error
+    for mesh in spec.meshes:
+        mesh.name = mesh.name or Path(mesh.file).stem  # geoms of an attached part look for the name with its prefix
+    return spec
 
 
 class UrdfDraft:
@@ -60,7 +92,9 @@ class UrdfDraft:
         self._names = [edits.base, *(model.body(k).name or f"body{k}" for k in range(1, model.nbody))]
         self._offsets = np.zeros((model.nbody, 3))
         self._materials: dict[str, ArrayLike] = {}
-        self._mimics = _mimics(model)
+        given = {name: (edit.joint, edit.multiplier, edit.offset) for name, edit in edits.mimic.items()}
+        leaders = {leader for leader, _, _ in given.values()}
+        self._mimics = {name: row for name, row in _mimics(model).items() if name not in leaders} | given
         self._refuse()
         self.meshes = MeshFiles(model)
         self._root = ET.Element("robot", name=name)
@@ -88,7 +122,11 @@ class UrdfDraft:
                     faults.append(f"joint {name!r} slides without limits")
                 self._offsets[body] = model.jnt_pos[k]
         geoms = {model.geom(k).name for k in range(model.ngeom)}
+        geoms |= {f"{name}_{piece:02d}_{tag}" for name in self._names for piece in range(99) for tag in _TAGS}
         faults += [f"edits.replace: no geom {name!r}" for name in edits.replace if name not in geoms]
+        joints = {_joint_name(model, k) for k in range(model.njnt)}
+        named = {*edits.mimic, *(edit.joint for edit in edits.mimic.values())}
+        faults += [f"edits.mimic: no joint {name!r}" for name in sorted(named - joints)]
         faults += [f"edits.boxes: no link {name!r}" for name in edits.boxes if name not in self._names]
         names = {*self._names, *edits.frames}
         for name, frame in edits.frames.items():
@@ -117,7 +155,7 @@ class UrdfDraft:
             parent = int(model.body_parentid[body])
             T = se3.make(_rotation(model.body_quat[body]), model.body_pos[body])
             T[:3, 3] += T[:3, :3] @ self._offsets[body] - self._offsets[parent]
-            if model.body_jntnum[body]:
+            if model.body_jntnum[body] and not self._is_fixed(int(model.body_jntadr[body])):
                 self._joint(int(model.body_jntadr[body]), self._names[parent], name, T)
             else:
                 self._fixed(f"{name}_fixed", self._names[parent], name, T)
@@ -129,6 +167,9 @@ class UrdfDraft:
             material = ET.Element("material", name=name)
             ET.SubElement(material, "color", rgba=" ".join(f"{float(v):.6g}" for v in np.ravel(rgba)))
             self._root.insert(k, material)
+
+    def _is_fixed(self, joint: int) -> bool:
+        return any(fnmatchcase(_joint_name(self._model, joint), pattern) for pattern in self._edits.fixed)
 
     def _place(self, frame: FrameEdit) -> tuple[str, Array]:
         """Parent link and pose (4, 4) of a frame."""
@@ -166,8 +207,10 @@ class UrdfDraft:
             found = [geom for geom, is_seen in zip(geoms, seen, strict=True) if is_seen == wanted]
             for piece, geom in enumerate(found):
                 name = geom.name or f"{link.get('name')}_{piece:02d}_{tag}"
-                edit = self._edits.replace.get(geom.name)
-                if edit is not None:
+                if name in self._edits.replace:
+                    edit = self._edits.replace[name]
+                    if edit is None:
+                        continue
                     _shape(link, tag, edit.name, se3.make(None, edit.xyz), "box", size=_numbers(edit.size))
                     continue
                 for element in self._geom(link, tag, name, geom, body):
@@ -218,8 +261,10 @@ class UrdfDraft:
         kind = ("revolute" if limited else "continuous") if turns else "prismatic"
         element = _joint_element(self._root, name, kind, parent, child, T)
         ET.SubElement(element, "axis", xyz=_numbers(model.jnt_axis[k]))
-        limits = dict(zip(("lower", "upper"), map(float, model.jnt_range[k]), strict=True)) if limited else {}
-        values = {**limits, "effort": _effort(model, k), "velocity": matching(self._edits.velocity, name, math.inf)}
+        ends = matching(self._edits.range, name, tuple(map(float, model.jnt_range[k])))
+        limits = dict(zip(("lower", "upper"), ends, strict=True)) if limited else {}
+        effort = matching(self._edits.effort, name, _effort(model, k))
+        values = {**limits, "effort": effort, "velocity": matching(self._edits.velocity, name, math.inf)}
         # urdfdom reads no joint without the limits of effort and velocity; 0: not known
         known = {key: _numbers([value if math.isfinite(value) else 0.0]) for key, value in values.items()}
         ET.SubElement(element, "limit", known)
@@ -254,7 +299,7 @@ def _actuators(model: mujoco.MjModel, k: int) -> list[int]:
     return np.flatnonzero(of_joints & (model.actuator_trnid[:, 0] == k)).tolist()
 
 
-def _mimics(model: mujoco.MjModel) -> Mapping[str, tuple[str, float, float]]:
+def _mimics(model: mujoco.MjModel) -> dict[str, tuple[str, float, float]]:
     """Leader, multiplier and offset of each joint that an equality couples; the one with an actuator leads.
 
     Raises:

@@ -15,17 +15,11 @@ import numpy as np
 from pydantic import Field
 
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.motors import BusRange
 from openarm_common.types import Array
 from openarm_control.servos import ServoConfig
 
 Share = Annotated[float, Field(ge=0.0, le=0.5)]
-
-#: Position range of the Damiao motors, +-rad, which 16 bits divide; of velocity (rad/s) and torque (N m) by motor of
-#: joints 1 to 7 (DM8009, DM4340, DM4310), which 12 bits divide. Source: the maker's MIT frames.
-MOTOR_RANGE = 12.5
-_VELOCITY_RANGE = np.array([45.0, 45.0, 10.0, 10.0, 30.0, 30.0, 30.0])
-_TORQUE_RANGE = np.array([54.0, 54.0, 28.0, 28.0, 10.0, 10.0, 10.0])
-
 
 class HardwareConfig(ServoConfig):
     """Motors of the arms, and by how much a robot differs from its description; by default as owners have them."""
@@ -35,7 +29,7 @@ class HardwareConfig(ServoConfig):
     # what a zero calibration leaves
     zero_rms: float = Field(default=0.1, ge=0.0, le=10.0, description="error of the joint zeros, deg rms")
     quantized: bool = Field(
-        default=True, description="position of 16 bits in +-12.5 rad, velocity and torque of 12 bits, as on the bus"
+        default=True, description="position of 16 bits, velocity and torque of 12 bits, where the robot has such a bus"
     )
     tool_stiffness: float = Field(
         default=300.0, ge=0.0, description="of the hand on the wrist about its x and y axes, N m/rad; 0: rigid"
@@ -50,8 +44,7 @@ class HardwareConfig(ServoConfig):
 
 #: Stiff servos that carry the arms and know where they are.
 IDEAL = HardwareConfig(
-    stiffness=(230, 230, 190, 190, 100, 100, 100),
-    damping=(2.7, 2.7, 2.2, 2.2, 1.5, 1.5, 1.5),
+    stiff=True,
     gravity_compensation=1.0,
     friction=(0.0, 0.0),
     latency=(0.0, 0.0),
@@ -101,18 +94,18 @@ class Hardware:
     mass: Mapping[str, float]
     gravity_compensation: float
     tool_stiffness: float
-    quantized: bool
+    bus: BusRange | None
 
     def encoders(self, description: RobotDescription, joint_names: tuple[str, ...]) -> Encoders:
         """Return what commands and states of joints go through; fingers are exact but for their latency."""
         steps = dict.fromkeys(joint_names, (0.0, 0.0, 0.0))
-        if self.quantized:
+        if self.bus is not None:
             for arm in description.arms.values():
                 for i, name in enumerate(arm.joints):
                     steps[name] = (
-                        2.0 * MOTOR_RANGE / (2.0**16 - 1.0),
-                        2.0 * float(_VELOCITY_RANGE[i]) / (2.0**12 - 1.0),
-                        2.0 * float(_TORQUE_RANGE[i]) / (2.0**12 - 1.0),
+                        2.0 * self.bus.position / (2.0**16 - 1.0),
+                        2.0 * self.bus.velocity[i] / (2.0**12 - 1.0),
+                        2.0 * self.bus.torque[i] / (2.0**12 - 1.0),
                     )
         position, velocity, effort = np.array([steps[name] for name in joint_names]).T
         arm_latency = {
@@ -133,7 +126,11 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
     Args:
         config: What is possible.
         description: The robot.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when the profile does not fit the arms.
     """
+    config = config.of(description)
     arms = description.arms
     joints = tuple(name for arm in arms.values() for name in arm.joints)
     rng = np.random.default_rng([config.dynamics_seed, 901])
@@ -147,7 +144,8 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
 
     n = len(joints)
     stiffness, damping, gearbox = (either(config.gain_error, n) for _ in range(3))
-    friction = rng.uniform(*config.friction, n)
+    dry = config.friction or (0.0, 0.0)
+    friction = rng.uniform(*dry, n)
     latency = np.repeat(rng.uniform(*config.latency, len(arms)), n // len(arms))
     links = [link for name in arms for link in description.links_of(name)]
     mass = dict(zip(links, either(config.mass_error, len(links)).tolist(), strict=True))
@@ -156,11 +154,11 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
         damping=named(np.tile(config.damping, len(arms)) * damping),
         armature=named(np.tile(config.armature, len(arms))),
         gearbox=named(gearbox),
-        friction=named(friction) if config.friction[1] > 0.0 else {},
+        friction=named(friction) if dry[1] > 0.0 else {},
         zero=named(np.radians(config.zero_rms) * zeros.standard_normal(n)),
         latency_s=named(latency),
         mass=mass,
-        gravity_compensation=config.gravity_compensation,
+        gravity_compensation=config.gravity_compensation or 0.0,
         tool_stiffness=config.tool_stiffness,
-        quantized=config.quantized,
+        bus=description.motors.bus if config.quantized and description.motors else None,
     )

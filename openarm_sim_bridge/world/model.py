@@ -26,7 +26,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.xml_text import floats
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
-from openarm_sim_bridge.world.hardware import IDEAL, MOTOR_RANGE, Hardware, drawn
+from openarm_sim_bridge.world.hardware import IDEAL, Hardware, drawn
 from openarm_sim_bridge.world.touch import add_hand_sensors
 from openarm_sim_bridge.world.world import compiled_model
 
@@ -239,7 +239,8 @@ def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: str, 
         actuator = _add_servo(
             spec, name, hardware.stiffness[name], hardware.damping[name], description.joints[name].effort
         )
-        actuator.ctrlrange = (-MOTOR_RANGE, MOTOR_RANGE)
+        if description.motors is not None and description.motors.bus is not None:
+            actuator.ctrlrange = (-description.motors.bus.position, description.motors.bus.position)
     add_hand_sensors(spec, description.arm(side).hand)
     if hardware.tool_stiffness > 0.0:
         _mount_softly(spec.body(description.arm(side).hand), hardware.tool_stiffness)
@@ -264,12 +265,13 @@ def _mount_softly(hand: mujoco.MjsBody, stiffness: float) -> None:
 def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: str, physics: PhysicsConfig) -> None:
     hand = description.hand(side)
     leader, lever = hand.joint, abs(hand.lever)
-    follower = next(joint.name for joint in description.joints.values() if joint.mimic == leader)
-    for name in (leader, follower):
+    followers = [joint for joint in description.joints.values() if joint.mimic == leader]
+    for name in (leader, *(joint.name for joint in followers)):
         joint = spec.joint(name)
         joint.armature = hand.parts.armature
         joint.actfrclimited = False
-        pad = spec.geom(f"{description.joints[name].child}_pad_collision")
+    for finger in description.arm(side).fingers:
+        pad = spec.geom(f"{finger}_pad_collision")
         # Priority: the pad's values decide over those of what it touches.
         pad.priority = 1
         pad.friction = physics.pad_friction
@@ -280,22 +282,23 @@ def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: s
     servo = _add_servo(spec, leader, kp, kv, physics.finger_force * lever)
     servo.ctrlrange = (description.joints[leader].lower, description.joints[leader].upper)
     # The importer couples mimic joints too, but softly: the fingers would drift apart under load.
+    names = {joint.name for joint in followers}
     for equality in list(spec.equalities):
-        if follower in (equality.name1, equality.name2):
+        if names & {equality.name1, equality.name2}:
             spec.delete(equality)
-    coupling = spec.add_equality(
-        name=follower,
-        type=mujoco.mjtEq.mjEQ_JOINT,
-        objtype=mujoco.mjtObj.mjOBJ_JOINT,
-        name1=follower,
-        name2=leader,
-        solref=physics.contact_solref,
-        solimp=physics.contact_solimp,
-    )
-    polynomial = np.zeros(len(coupling.data))
-    polynomial[0] = description.joints[follower].offset
-    polynomial[1] = description.joints[follower].multiplier
-    coupling.data = polynomial
+    for follower in followers:
+        coupling = spec.add_equality(
+            name=follower.name,
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            name1=follower.name,
+            name2=leader,
+            solref=physics.contact_solref,
+            solimp=physics.contact_solimp,
+        )
+        polynomial = np.zeros(len(coupling.data))
+        polynomial[:2] = follower.offset, follower.multiplier
+        coupling.data = polynomial
 
 
 def _add_servo(spec: mujoco.MjSpec, name: str, kp: float, kv: float, force: float) -> mujoco.MjsActuator:

@@ -18,7 +18,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.types import Array
 from openarm_motion.config import LimitsConfig
-from openarm_motion.timing.trajectory import JointLimits, time_polyline
+from openarm_motion.timing.trajectory import time_polyline
 
 MS = 1_000_000
 URDF = """<robot name="two">
@@ -115,8 +115,7 @@ def test_ten_hertz_serve_an_arm_at_rest_and_not_one_that_accelerates(measured: b
 @pytest.mark.parametrize("measured", [True, False])
 @pytest.mark.requirement("A-72")
 def test_a_hundred_hertz_serve_the_fastest_motions_of_the_planner(measured: bool) -> None:
-    config, rng = LimitsConfig(), np.random.default_rng(0)
-    limits = JointLimits(*(np.array(values) for values in (config.velocity, config.acceleration, config.jerk)))
+    limits, rng = LimitsConfig().of(ROBOT.motion, "right", ARM), np.random.default_rng(0)
     refused = 0
     for _ in range(5):
         path = time_polyline(ARM, rng.uniform(LOW, HIGH, (2, 7)), limits)

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
@@ -39,7 +42,7 @@ def test_an_ideal_robot_is_as_described(description: RobotDescription) -> None:
 
 
 def test_what_is_drawn_arrives_in_the_model(description: RobotDescription) -> None:
-    config = HardwareConfig(gain_error=0.3, mass_error=0.1)
+    config = HardwareConfig(gain_error=0.3, mass_error=0.1).of(description)
     made = drawn(config, description)
     model = robot_spec(description, PhysicsConfig(), made).compile()
     nominal = robot_spec(description, PhysicsConfig()).compile()
@@ -113,7 +116,14 @@ def test_later_commands_do_not_overtake(description: RobotDescription) -> None:
     np.testing.assert_allclose(np.sort(world.data.ctrl), np.sort(start))  # what was on its way is forgotten
 
 
-@pytest.mark.parametrize("wrong", [{"stiffness": (1.0,) * 6}, {"friction": (0.5, 0.2)}, {"latency": (-1.0, 0.0)}])
+def test_gains_for_other_arms_are_refused(description: RobotDescription) -> None:
+    with pytest.raises(OpenArmError, match=r"stiffness has 6 numbers, arm 'left' has 7 joints"):
+        drawn(HardwareConfig(stiffness=(1.0,) * 6), description)
+    with pytest.raises(OpenArmError, match="lacks `motors`"):
+        drawn(HardwareConfig(), replace(description, motors=None))
+
+
+@pytest.mark.parametrize("wrong", [{"stiffness": (-1.0,) * 7}, {"friction": (0.5, 0.2)}, {"latency": (-1.0, 0.0)}])
 def test_an_impossible_robot_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         HardwareConfig.model_validate(wrong)

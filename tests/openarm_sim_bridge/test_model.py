@@ -340,14 +340,15 @@ def test_physics_settings_arrive_in_the_model(description: RobotDescription) -> 
         for name, joint in yourdfpy.URDF.load(io.StringIO(description.urdf), load_meshes=False).joint_map.items()
     }
     assert (default.opt.timestep, default.opt.impratio, default.opt.noslip_iterations) == (0.002, 10.0, 4)
+    ideal = IDEAL.of(description)
     for side in SIDES:
         for i, name in enumerate(description.arm_joints(side)):
             actuator, joint = default.actuator(name), default.joint(name)
-            assert actuator.gainprm[0] == IDEAL.stiffness[i]
-            assert actuator.biasprm[2] == -IDEAL.damping[i]
+            assert actuator.gainprm[0] == ideal.stiffness[i]
+            assert actuator.biasprm[2] == -ideal.damping[i]
             assert default.dof_damping[joint.dofadr[0]] == float(dynamics[name].damping)
             assert default.dof_frictionloss[joint.dofadr[0]] == float(dynamics[name].friction)
-            assert default.dof_armature[joint.dofadr[0]] == IDEAL.armature[i]
+            assert default.dof_armature[joint.dofadr[0]] == ideal.armature[i]
 
 
 @pytest.mark.parametrize("wrong", [{"timestep": 0.0}, {"cone": "round"}, {"stiffness": 1.0}])
