@@ -2,14 +2,13 @@
 """Inverse kinematics compared with peers: pinocchio's kinematics with the loop in Python, ikpy and mink. rad, m.
 
 Targets are tool poses of random configurations within the limits: uniform ones, and such with each joint, at a
-probability of 1/3, within 0.02 rad of a limit. A UR5 and a Panda are measured where example-robot-data is installed.
+probability of 1/3, within 0.02 rad of a limit. A Panda and a UR5e are measured, too.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.metadata
 import tempfile
 import time
 import warnings
@@ -22,6 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from benchmarks.report import Row
+from benchmarks.robot_models import ROBOTS
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
 from openarm_common.scene.scene import Scene
@@ -37,11 +37,6 @@ TOLERANCE = (1e-4, 1e-3)
 _SEED = 60_000
 #: Probability of a joint to be near a limit, and how near, rad.
 _NEAR = (1.0 / 3.0, 0.02)
-#: Files of other robots in example-robot-data, and their tool links.
-_OTHERS = {
-    "ur5": ("robots/ur_description/urdf/ur5_robot.urdf", "tool0"),
-    "panda": ("robots/panda_description/urdf/panda_collision.urdf", "panda_hand_tcp"),
-}
 #: Target of the 95th percentile, ms, by method.
 _P95 = {"closed form": 0.2, "numeric": 1.0}
 
@@ -113,15 +108,11 @@ def _rows_of(metric: str, arm: IkArm, poses: Array, peer_count: int) -> list[Row
 
 
 def _others() -> dict[str, IkArm]:
-    """The arms of example-robot-data; none when it is not installed."""
-    try:
-        package = importlib.metadata.distribution("example-robot-data")
-    except importlib.metadata.PackageNotFoundError:
-        return {}
-    folder = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data")))
+    """The robots of one arm."""
     out: dict[str, IkArm] = {}
-    for name, (path, tool) in _OTHERS.items():
-        description = RobotDescription.from_urdf((folder / path).read_text(encoding="utf-8"))
+    for name in ROBOTS:
+        description = RobotDescription.load(name)
+        tool = description.tcp_link(description.arm_names[0])
         out[name] = IkArm(description, InverseKinematics(ArmKinematics(description, tool)))
     return out
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Panda and a UR5 by their meshes, among shelves, boxes, cages and tables: seven families, 50 problems each.
+"""A Panda and a UR5e by their meshes, among shelves, boxes, cages and tables: seven families, 50 problems each.
 
     python benchmarks/motion_robots.py [--quick] [--only PREFIX] [--json PATH] [--tuning]
 
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +27,7 @@ import numpy as np
 
 from benchmarks.motion_problems import timed
 from benchmarks.report import Row, write_report
-from benchmarks.robot_models import ABSENT, ROBOTS, TrueMeshes, example_robots, load_arm, states_of
+from benchmarks.robot_models import ROBOTS, TrueMeshes, load_arm, states_of
 from benchmarks.robot_problems import FAMILIES, RobotProblem, problems
 from openarm_common.types import Array
 from openarm_motion.planning.arm import Arm, StartState
@@ -140,9 +139,6 @@ def main() -> None:
     parser.add_argument("--tuning", action="store_true", help="the problems that steps of the search were chosen on")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    folder = example_robots()
-    if folder is None:
-        sys.exit(ABSENT)
     count, seed = 5 if args.quick else 50, _TUNING if args.tuning else _REPORTED
     print(
         "robot  family            ours  OMPL feasible   median      p95 OMPL med. OMPL p95   ratio  hits OMPL's   (ms)"
@@ -152,8 +148,8 @@ def main() -> None:
         families = [family for family in FAMILIES if f"{robot}_{family}".startswith(args.only)]
         if not families:
             continue
-        arm = load_arm(folder, robot, touching=True)
-        judge = TrueMeshes(folder, robot, arm.names)
+        arm = load_arm(robot, touching=True)
+        judge = TrueMeshes(robot)
         # one problem first, so that everything is compiled
         family_tally(robot, "", arm, judge, problems(robot, families[0], 1, 0, arm.kinematics, judge))
         tallies: list[Tally] = []

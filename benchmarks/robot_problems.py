@@ -198,6 +198,7 @@ def _problem(
 ) -> RobotProblem | None:
     """A problem in a scene that is shifted and turned; None when start or goal can't be reached."""
     *shift, turn = rng.uniform(-1.0, 1.0, 4) * scene.spread
+    shift[2] += judge.stand
     T = se3.make(se3.rot_z(turn), (0.0, 0.0, 0.0)) @ se3.make(None, shift)
     bodies = tuple(_moved(body, T) for body in scene.bodies)
     hits = judge.around(bodies)

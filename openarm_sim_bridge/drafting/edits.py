@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import Self, TypeVar
 
@@ -88,7 +88,7 @@ class MimicEdit(Config):
 
 
 class Edits(Config):
-    """What the file says. Keys of `velocity`, `effort`, `damping`, `fixed`, `detail` are patterns: `*` is any text.
+    """What the file says. Keys of `velocity`, `effort`, `damping`, `fixed`, `hulls`, `detail` are patterns: `*` is any text.
 
     Names are those of the robot, with its prefix.
 
@@ -105,6 +105,8 @@ class Edits(Config):
         range: The same of positions, such as those that cables leave, rad or m.
         damping: By joint in place of the MJCF's, N m s/rad or N s/m.
         boxes: All shapes of a link, seen and touched.
+        hulls: Links that are touched where they are seen: hulls of their visual meshes take the place of the MJCF's shapes.
+        add: Collision shapes in addition, by link, such as of one that the MJCF only shows.
         replace: A collision shape by its name; none: it is left out.
         frames: Links in addition.
         materials: rgba of those of boxes.
@@ -124,11 +126,18 @@ class Edits(Config):
     velocity: Mapping[str, float] = Field(default_factory=dict)
     damping: Mapping[str, float] = Field(default_factory=dict)
     boxes: Mapping[str, tuple[BoxEdit, ...]] = Field(default_factory=dict)
+    hulls: tuple[str, ...] = ()
+    add: Mapping[str, tuple[BoxEdit, ...]] = Field(default_factory=dict)
     replace: Mapping[str, BoxEdit | None] = Field(default_factory=dict)
     frames: Mapping[str, FrameEdit] = Field(default_factory=dict)
     materials: Mapping[str, tuple[float, float, float, float]] = Field(default_factory=dict)
     triangles: int = Field(default=60_000, ge=1000)
     detail: Mapping[str, float] = Field(default_factory=dict)
+
+
+def matches(patterns: Iterable[str], name: str) -> bool:
+    """Return whether a name is of one of the patterns."""
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
 def matching(patterns: Mapping[str, ValueT], name: str, default: ValueT) -> ValueT:

@@ -21,8 +21,12 @@ from openarm_sim_bridge.drafting.edits import matching
 Triangles = NDArray[np.int64]
 #: A visual mesh keeps this many triangles, or all that it has.
 _LEAST = 60
-#: Of the simplification, from 0 on: lower keeps shapes longer.
-_AGGRESSIVENESS = 2
+#: Aggressiveness of the simplification, from 0 on, and the distance at which corners are one, m: lower ones keep shapes
+#: longer; the next where a mesh, torn or of many shells, keeps too many triangles.
+_ATTEMPTS = ((2, 1e-6), (5, 1e-6), (5, 5e-4), (8, 1e-3), (8, 2e-3))
+_ENOUGH = 1.2
+#: Most triangles of the hull around a mesh that is made to be seen, and grids that its corners move to, m.
+_HULL_FACES, _GRIDS = 300, (0.001, 0.002, 0.003, 0.004, 0.006)
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -48,8 +52,14 @@ class MeshFiles:
         self._sources: dict[tuple[str, tuple[float, ...]], str] = {}
         self._uses: dict[str, int] = {}
 
-    def placed(self, geom: Any, *, seen: bool) -> PlacedMesh:
-        """Take the mesh of a geom; `seen`: its triangles, or else its convex hull, which MuJoCo collides with."""
+    def placed(self, geom: Any, *, seen: bool, coarse: bool = False) -> PlacedMesh:
+        """Take the mesh of a geom.
+
+        Args:
+            geom: Of the model.
+            seen: Its triangles, or else its convex hull, which MuJoCo collides with.
+            coarse: A hull of few triangles around one that is made to be seen.
+        """
         model, k = self._model, int(geom.dataid[0])
         scale = np.array(model.mesh_scale[k])
         T_file_mesh = _pose(model.mesh_pos[k], model.mesh_quat[k])
@@ -66,7 +76,8 @@ class MeshFiles:
             triangles = np.array(model.mesh_face[first : first + count], np.int64)
             if np.prod(scale) < 0.0:
                 triangles = triangles[:, ::-1]  # MuJoCo has turned them
-            self._files[file] = (vertices, triangles) if seen else hull_mesh(np.unique(vertices, axis=0))
+            hull = coarse_hull if coarse else hull_mesh
+            self._files[file] = (vertices, triangles) if seen else hull(np.unique(vertices, axis=0))
         self._uses[file] = self._uses.get(file, 0) + 1
         return PlacedMesh(file, T, np.sign(scale))
 
@@ -105,6 +116,19 @@ class MeshFiles:
         return f"meshes/{'visual' if seen else 'collision'}/{f'{stem}_{number}' if number else stem}.stl"
 
 
+def coarse_hull(points: Array) -> tuple[Array, Triangles]:
+    """Return the hull of points that are moved outwards, to a grid so fine that it has few triangles; see `hull_mesh`."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    out = hull_mesh(points)
+    for cell in _GRIDS:
+        if len(out[1]) <= _HULL_FACES:
+            break
+        away = points - middle
+        moved = middle + np.sign(away) * np.ceil(np.abs(away) / cell) * cell
+        out = hull_mesh(np.unique(moved.round(6), axis=0))
+    return out
+
+
 def write_stl(path: Path, vertices: Array, triangles: Triangles) -> None:
     """Write triangles (m, 3) of vertices (n, 3) as binary STL."""
     facets = np.zeros(len(triangles), _FACET)
@@ -132,11 +156,16 @@ def simplified(vertices: Array, triangles: Triangles, budget: int) -> tuple[Arra
             Code.ENVIRONMENT,
             "visual meshes are simplified with fast-simplification, which is not installed: extra `draft`",
         ) from error
-    points, same = np.unique(vertices, axis=0, return_inverse=True)  # triangles that share a corner must say so
-    faces = same.reshape(-1)[triangles].astype(np.int32)
-    found: tuple[Any, Any] = fast_simplification.simplify(
-        points.astype(np.float32), faces, target_count=budget, agg=_AGGRESSIVENESS
-    )
+    found: tuple[Any, Any] = vertices, triangles
+    for strength, cell in _ATTEMPTS:
+        # triangles that share a corner must say so
+        points, same = np.unique((vertices / cell).round() * cell, axis=0, return_inverse=True)
+        faces = same.reshape(-1)[triangles].astype(np.int32)
+        a, b, c = faces.T
+        faces = faces[(a != b) & (b != c) & (c != a)]
+        found = fast_simplification.simplify(points.astype(np.float32), faces, target_count=budget, agg=strength)
+        if len(found[1]) <= _ENOUGH * budget:
+            break
     return np.asarray(found[0], np.float64), np.asarray(found[1], np.int64)
 
 

@@ -12,7 +12,6 @@ import math
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from numpy.typing import ArrayLike
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_sim_bridge.drafting.edits import BoxEdit, Edits, FrameEdit, matching
+from openarm_sim_bridge.drafting.edits import BoxEdit, Edits, FrameEdit, matches, matching
 from openarm_sim_bridge.drafting.mesh_files import MeshFiles
 
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
@@ -127,7 +126,8 @@ class UrdfDraft:
         joints = {_joint_name(model, k) for k in range(model.njnt)}
         named = {*edits.mimic, *(edit.joint for edit in edits.mimic.values())}
         faults += [f"edits.mimic: no joint {name!r}" for name in sorted(named - joints)]
-        faults += [f"edits.boxes: no link {name!r}" for name in edits.boxes if name not in self._names]
+        for what, links in (("boxes", edits.boxes), ("add", edits.add)):
+            faults += [f"edits.{what}: no link {name!r}" for name in links if name not in self._names]
         names = {*self._names, *edits.frames}
         for name, frame in edits.frames.items():
             if frame.parent and frame.parent not in names:
@@ -149,6 +149,9 @@ class UrdfDraft:
                 self._boxes(link, self._edits.boxes[name])
             else:
                 self._shapes(link, body)
+            for box in self._edits.add.get(name, ()):
+                T = se3.make(None, box.xyz)
+                _shape(link, "collision", f"{name}_{box.name}_collision", T, "box", size=_numbers(box.size))
             if body == 0:
                 self._fixed(f"{name}_fixed", _ROOT, name, np.eye(4))
                 continue
@@ -169,7 +172,7 @@ class UrdfDraft:
             self._root.insert(k, material)
 
     def _is_fixed(self, joint: int) -> bool:
-        return any(fnmatchcase(_joint_name(self._model, joint), pattern) for pattern in self._edits.fixed)
+        return matches(self._edits.fixed, _joint_name(self._model, joint))
 
     def _place(self, frame: FrameEdit) -> tuple[str, Array]:
         """Parent link and pose (4, 4) of a frame."""
@@ -203,7 +206,8 @@ class UrdfDraft:
         model = self._model
         geoms = [model.geom(k) for k in range(model.ngeom) if model.geom_bodyid[k] == body]
         seen = [not (geom.contype[0] or geom.conaffinity[0]) for geom in geoms]
-        for tag, wanted in (("visual", True), ("collision", False)):
+        hulls = matches(self._edits.hulls, self._names[body])
+        for tag, wanted in (("visual", True), ("collision", hulls)):
             found = [geom for geom, is_seen in zip(geoms, seen, strict=True) if is_seen == wanted]
             for piece, geom in enumerate(found):
                 name = geom.name or f"{link.get('name')}_{piece:02d}_{tag}"
@@ -225,7 +229,8 @@ class UrdfDraft:
         kind, (a, b, c) = int(geom.type[0]), (2.0 * float(v) for v in geom.size)
         T = se3.make(_rotation(geom.quat), geom.pos - self._offsets[body])
         if kind == _GEOM.mjGEOM_MESH:
-            mesh = self.meshes.placed(geom, seen=tag == "visual")
+            coarse = not (geom.contype[0] or geom.conaffinity[0])
+            mesh = self.meshes.placed(geom, seen=tag == "visual", coarse=coarse)
             T = mesh.T.copy()
             T[:3, 3] -= self._offsets[body]
             size = {"filename": mesh.file}

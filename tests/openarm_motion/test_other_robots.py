@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A UR5 and a Panda through the code of OpenArm's arms, by configuration alone."""
+"""A UR5e and a Panda through the code of OpenArm's arms, by their folders alone."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from benchmarks.robot_models import ABSENT, ROBOTS, TrueMeshes, example_robots, load_arm, states_of
+from benchmarks.robot_models import ROBOTS, TrueMeshes, load_arm, states_of
 from benchmarks.robot_problems import FAMILIES, problems
 from openarm_common import se3
 from openarm_motion.collision.fast import FastScene
@@ -20,10 +20,7 @@ from openarm_motion.timing.validation import validate_trajectory
 @pytest.fixture(scope="module", params=list(ROBOTS))
 def robot(request: pytest.FixtureRequest) -> tuple[Arm, np.ndarray]:
     """The arm and a configuration to start from."""
-    folder = example_robots()
-    if folder is None:
-        pytest.skip(ABSENT)
-    return load_arm(folder, request.param), np.array(ROBOTS[request.param].start)
+    return load_arm(request.param), np.array(ROBOTS[request.param].start)
 
 
 @pytest.mark.requirement("B-13")
@@ -84,11 +81,8 @@ def test_a_straight_line_stays_on_it(robot: tuple[Arm, np.ndarray]) -> None:
 @pytest.mark.requirement("B-07")
 @pytest.mark.parametrize("name", list(ROBOTS))
 def test_problems_are_solved_and_no_path_touches_the_triangles_of_the_meshes(name: str) -> None:
-    folder = example_robots()
-    if folder is None:
-        pytest.skip(ABSENT)
-    arm = load_arm(folder, name, touching=True)
-    judge = TrueMeshes(folder, name, arm.names)
+    arm = load_arm(name, touching=True)
+    judge = TrueMeshes(name)
     for family in FAMILIES:
         for problem in problems(name, family, 1, 2, arm.kinematics, judge):
             scene = arm.scene({}, problem.obstacles)  # pyright: ignore[reportArgumentType]

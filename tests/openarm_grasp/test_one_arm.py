@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robots of one arm, six or seven joints, fingers on slides or a linkage: what their folders say, and that they grasp."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any, cast
+
+import mujoco
+import numpy as np
+import pytest
+
+from openarm_common.errors import OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import ROBOT, load_folder
+from openarm_common.scene.scene import Scene, SceneObject
+from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.tasks.suites import make_task
+from openarm_evaluation.campaign.tasks.task import Task
+from openarm_evaluation.campaign.trial import Trials
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.strategies.hand_over import hand_over
+from openarm_grasp.strategies.pair import simultaneous
+from openarm_motion.kinematics.chain import ArmKinematics
+from openarm_motion.kinematics.inverse import InverseKinematics
+from openarm_sim_bridge.drafting.check import folder_faults
+from openarm_sim_bridge.world.model import PhysicsConfig, robot_spec
+
+ROBOTS = ("panda", "ur5e")
+
+
+@pytest.fixture(params=ROBOTS)
+def robot(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> RobotDescription:
+    monkeypatch.setenv(ROBOT, request.param)
+    return RobotDescription.load()
+
+
+@pytest.mark.requirement("R-05")
+def test_nothing_is_wrong_with_the_folder(robot: RobotDescription) -> None:
+    assert folder_faults(load_folder(robot.name)[0]) == []
+
+
+@pytest.mark.requirement("B-13")
+def test_the_inverse_kinematics_reaches_what_the_arm_reaches(robot: RobotDescription) -> None:
+    (arm,) = robot.arm_names
+    inverse = InverseKinematics(ArmKinematics(robot, robot.tcp_link(arm)))
+    chain = inverse.kinematics
+    for pose in chain.fk_many(np.random.default_rng(51).uniform(chain.lower, chain.upper, (200, chain.n))):
+        found = inverse.nearest(pose)
+        assert found.success
+        assert chain.margin(found.q) >= -1e-6
+        np.testing.assert_allclose(chain.fk(found.q)[:3, 3], pose[:3, 3], atol=1e-4)
+
+
+@pytest.mark.requirement("R-05")
+def test_pads_close_on_each_other_and_stand_apart_as_the_table_of_the_hand_says(robot: RobotDescription) -> None:
+    """By the compiled model with its couplings, for every joint that follows the driven one."""
+    (arm,) = robot.arm_names
+    hand, model = robot.hand(arm), robot_spec(robot, PhysicsConfig()).compile()
+    data = mujoco.MjData(model)
+    pads = [model.geom(f"{link}_pad_collision").id for link in robot.arm(arm).fingers]
+    data.qpos[model.joint("panda_joint4").qposadr[0] if robot.name == "panda" else 0] = -1.5 * (robot.name == "panda")
+    servo = model.actuator(hand.joint).id
+    gaps: list[float] = []
+    for finger in (0.01, 0.025, hand.parts.opening):
+        for actuator in range(model.nu):
+            data.ctrl[actuator] = data.qpos[model.jnt_qposadr[model.actuator_trnid[actuator, 0]]]
+        data.ctrl[servo] = hand.position(finger)
+        model.opt.gravity[:] = 0.0
+        mujoco.mj_step(model, data, 800)
+        a, b = (data.geom_xpos[pad] for pad in pads)
+        axis = data.site_xmat[model.site(robot.tcp_link(arm)).id].reshape(3, 3)[:, 1]
+        thick = 2.0 * float(min(model.geom_size[pads[0]]))
+        gaps.append(abs(float((a - b) @ axis)) - thick)
+        assert gaps[-1] == pytest.approx(2.0 * finger, abs=1e-3)
+
+
+def test_what_takes_two_arms_is_not_offered(robot: RobotDescription) -> None:
+    context = SimpleNamespace(shoulders={robot.arm_names[0]: (0.0, 0.0)})
+    findings = SimpleNamespace(place_refused=True)
+    task = SimpleNamespace(context=context, outcome=object(), request=SimpleNamespace(place=(0.4, 0.0)), findings=findings)
+    assert asyncio.run(hand_over(cast("Any", task))) is None
+    request, notes = SimpleNamespace(label="red", place=None), list[str]()
+    pair = SimpleNamespace(
+        requests=(request, request), session=SimpleNamespace(context=context), note=notes.append, reason=""
+    )
+    assert asyncio.run(simultaneous(cast("Any", pair))) is None
+    assert "one arm" in notes[-1]
+    with pytest.raises(OpenArmError, match="needs two arms"):
+        make_task("handover", 0)
+
+
+@pytest.mark.requirement("R-05", "R-06")
+def test_it_places_an_object_and_looks_with_the_camera_on_its_hand(robot: RobotDescription) -> None:
+    item = SceneObject(name="box", shape="box", size=(0.05, 0.06, 0.06), color="red", position=(0.5, 0.15), yaw=0.3)
+    trials = Trials(
+        Task("nominal", 1, Scene(name="one", objects=(item,)), ("red",)),
+        SimulatedSenses(depth_noise=True, sets=()),
+        GraspConfig(),
+    )
+    (grasp,) = trials.run()["grasps"]
+    assert (grasp["outcome"], grasp["arm"], grasp["attempts"]) == ("placed", robot.arm_names[0], 1), grasp["message"]
+    assert grasp["place_error_mm"] < 6.0
+    assert "the wrist camera sees it" in " ".join(step.reason for step in trials.steps)
