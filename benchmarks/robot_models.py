@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots of one arm for tests and benchmarks: those of `models/robots`, and a judge that knows their triangles. m, rad."""
+"""Robots of one arm of `models/robots` for tests and benchmarks, and a judge that knows their triangles. m, rad."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def load_arm(name: str, *, touching: bool = False) -> Arm:
 
 
 class TrueMeshes:
-    """A robot by the triangles of its mesh files, with boxes and cylinders around it; independent of the suite's layers.
+    """A robot by the triangles of its mesh files, with bodies around it; independent of the suite's layers.
 
     Args:
         name: Of the robot.

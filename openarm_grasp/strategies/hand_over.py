@@ -60,11 +60,10 @@ async def hand_over(task: Task) -> GraspOutcome | None:
 
     When the taker is refused after all, again from where the object then is.
     """
-    asked, most = task.request, task.context.config.hand_over.rounds
-    known = task.outcome
+    asked, known = task.request, task.outcome
     if known is None or asked.place is None or not task.findings.place_refused or len(task.context.shoulders) < 2:
         return None
-    refused = None
+    refused, most = None, task.context.config.hand_over.rounds
     for number in range(1, most + 1):
         found = task.findings.need_sighting()
         try:

@@ -88,7 +88,7 @@ class MimicEdit(Config):
 
 
 class Edits(Config):
-    """What the file says. Keys of `velocity`, `effort`, `damping`, `fixed`, `hulls`, `detail` are patterns: `*` is any text.
+    """What the file says. In velocity, effort, range, damping, fixed, hulls and detail, `*` of a name is any text.
 
     Names are those of the robot, with its prefix.
 
@@ -105,7 +105,7 @@ class Edits(Config):
         range: The same of positions, such as those that cables leave, rad or m.
         damping: By joint in place of the MJCF's, N m s/rad or N s/m.
         boxes: All shapes of a link, seen and touched.
-        hulls: Links that are touched where they are seen: hulls of their visual meshes take the place of the MJCF's shapes.
+        hulls: Links that collide where they are seen: hulls of their visual meshes in place of the MJCF's shapes.
         add: Collision shapes in addition, by link, such as of one that the MJCF only shows.
         replace: A collision shape by its name; none: it is left out.
         frames: Links in addition.

@@ -117,7 +117,7 @@ class MeshFiles:
 
 
 def coarse_hull(points: Array) -> tuple[Array, Triangles]:
-    """Return the hull of points that are moved outwards, to a grid so fine that it has few triangles; see `hull_mesh`."""
+    """Return the hull of points, moved outwards to a grid until it has few triangles; see `hull_mesh`."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     out = hull_mesh(points)
     for cell in _GRIDS:

@@ -21,6 +21,7 @@ from openarm_control.servos import ServoConfig
 
 Share = Annotated[float, Field(ge=0.0, le=0.5)]
 
+
 class HardwareConfig(ServoConfig):
     """Motors of the arms, and by how much a robot differs from its description; by default as owners have them."""
 

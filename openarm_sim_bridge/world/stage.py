@@ -57,7 +57,9 @@ class Stage:
     @cached_property
     def servos(self) -> dict[str, ServoModel]:
         """What the profile says of the servos by side, as a client knows it that has not identified them."""
-        return {side: self._hardware.model(self.description, load) for side, load in arm_loads(self.description).items()}
+        return {
+            side: self._hardware.model(self.description, load) for side, load in arm_loads(self.description).items()
+        }
 
     def world(
         self, scene: Scene, add: Callable[[mujoco.MjSpec], None] = lambda _: None, *, each_step: bool = False

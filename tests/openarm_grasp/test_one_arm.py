@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots of one arm, six or seven joints, fingers on slides or a linkage: what their folders say, and that they grasp."""
+"""Robots of one arm, with six or seven joints, and fingers on slides or a linkage."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_sim_bridge.drafting.check import folder_faults
 from openarm_sim_bridge.world.model import PhysicsConfig, robot_spec
+from openarm_sim_bridge.world.world import start_qpos
 
 ROBOTS = ("panda", "ur5e")
 
@@ -60,26 +61,26 @@ def test_pads_close_on_each_other_and_stand_apart_as_the_table_of_the_hand_says(
     hand, model = robot.hand(arm), robot_spec(robot, PhysicsConfig()).compile()
     data = mujoco.MjData(model)
     pads = [model.geom(f"{link}_pad_collision").id for link in robot.arm(arm).fingers]
-    data.qpos[model.joint("panda_joint4").qposadr[0] if robot.name == "panda" else 0] = -1.5 * (robot.name == "panda")
+    data.qpos[:] = start_qpos(model, robot.group_state(f"{arm}_arm", "home"))
+    model.opt.gravity[:] = 0.0
     servo = model.actuator(hand.joint).id
-    gaps: list[float] = []
     for finger in (0.01, 0.025, hand.parts.opening):
         for actuator in range(model.nu):
             data.ctrl[actuator] = data.qpos[model.jnt_qposadr[model.actuator_trnid[actuator, 0]]]
         data.ctrl[servo] = hand.position(finger)
-        model.opt.gravity[:] = 0.0
         mujoco.mj_step(model, data, 800)
         a, b = (data.geom_xpos[pad] for pad in pads)
         axis = data.site_xmat[model.site(robot.tcp_link(arm)).id].reshape(3, 3)[:, 1]
         thick = 2.0 * float(min(model.geom_size[pads[0]]))
-        gaps.append(abs(float((a - b) @ axis)) - thick)
-        assert gaps[-1] == pytest.approx(2.0 * finger, abs=1e-3)
+        assert abs(float((a - b) @ axis)) - thick == pytest.approx(2.0 * finger, abs=1e-3)
 
 
 def test_what_takes_two_arms_is_not_offered(robot: RobotDescription) -> None:
     context = SimpleNamespace(shoulders={robot.arm_names[0]: (0.0, 0.0)})
     findings = SimpleNamespace(place_refused=True)
-    task = SimpleNamespace(context=context, outcome=object(), request=SimpleNamespace(place=(0.4, 0.0)), findings=findings)
+    task = SimpleNamespace(
+        context=context, outcome=object(), request=SimpleNamespace(place=(0.4, 0.0)), findings=findings
+    )
     assert asyncio.run(hand_over(cast("Any", task))) is None
     request, notes = SimpleNamespace(label="red", place=None), list[str]()
     pair = SimpleNamespace(
