@@ -26,7 +26,7 @@ _LEAST = 60
 _ATTEMPTS = ((2, 1e-6), (5, 1e-6), (5, 5e-4), (8, 1e-3), (8, 2e-3))
 _ENOUGH = 1.2
 #: Most triangles of the hull around a mesh that is made to be seen, and grids that its corners move to, m.
-_HULL_FACES, _GRIDS = 300, (0.001, 0.002, 0.003, 0.004, 0.006)
+_HULL_FACES, _GRIDS = 300, (0.001, 0.002, 0.003, 0.004, 0.006, 0.008, 0.012)
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 

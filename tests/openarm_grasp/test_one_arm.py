@@ -37,7 +37,7 @@ def robot(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ro
     return RobotDescription.load()
 
 
-@pytest.mark.requirement("R-05")
+@pytest.mark.requirement("B-13")
 def test_nothing_is_wrong_with_the_folder(robot: RobotDescription) -> None:
     assert folder_faults(load_folder(robot.name)[0]) == []
 
@@ -54,7 +54,7 @@ def test_the_inverse_kinematics_reaches_what_the_arm_reaches(robot: RobotDescrip
         np.testing.assert_allclose(chain.fk(found.q)[:3, 3], pose[:3, 3], atol=1e-4)
 
 
-@pytest.mark.requirement("R-05")
+@pytest.mark.requirement("B-13")
 def test_pads_close_on_each_other_and_stand_apart_as_the_table_of_the_hand_says(robot: RobotDescription) -> None:
     """By the compiled model with its couplings, for every joint that follows the driven one."""
     (arm,) = robot.arm_names
@@ -92,7 +92,7 @@ def test_what_takes_two_arms_is_not_offered(robot: RobotDescription) -> None:
         make_task("handover", 0)
 
 
-@pytest.mark.requirement("R-05", "R-06")
+@pytest.mark.requirement("B-13")
 def test_it_places_an_object_and_looks_with_the_camera_on_its_hand(robot: RobotDescription) -> None:
     item = SceneObject(name="box", shape="box", size=(0.05, 0.06, 0.06), color="red", position=(0.5, 0.15), yaw=0.3)
     trials = Trials(
