@@ -152,7 +152,8 @@ class RobotDescription:
     def of_folder(self, name: str, parts: RobotFolder) -> RobotDescription:
         """Return the robot with the name of its folder and what `robot.yaml` says."""
         hand, arms = parts.hand, parts.arms
-        hands = {key: Hand(arm.finger_joint, arm.finger_sign, hand) for key, arm in arms.items()} if hand else {}
+        moved = {key: arm for key, arm in arms.items() if hand is not None and arm.finger_joint}
+        hands = {key: Hand(arm.finger_joint, arm.finger_sign, hand) for key, arm in moved.items()} if hand else {}
         said = {"mirror": parts.mirror, "motion": parts.motion, "motors": parts.motors}
         return replace(self, name=name, base=parts.base, arms=arms, hands=hands, **said)
 
@@ -184,7 +185,7 @@ class RobotDescription:
         """
         self.arm(arm)
         if arm not in self.hands:
-            text = f"robot {self.name!r} has no hand: its robot.yaml lacks `hand`"
+            text = f"arm {arm!r} of robot {self.name!r} has no hand: its robot.yaml lacks `hand`, or its finger_joint"
             raise OpenArmError(Code.CONFIG_INVALID, text)
         return self.hands[arm]
 
@@ -342,7 +343,7 @@ def part_faults(parts: RobotFolder, robot: RobotDescription) -> list[str]:
     for name, arm in parts.arms.items():
         links = [arm.base, arm.flange, arm.hand, arm.tcp, *arm.fingers]
         faults += [f"arms.{name}: no link {link!r}" for link in links if link not in robot.links]
-        joints = (*arm.joints, arm.finger_joint)
+        joints = arm.controlled
         faults += [f"arms.{name}: no joint {joint!r}" for joint in joints if joint not in robot.joints]
         if f"{name}_arm" not in robot.semantics.groups:
             faults.append(f"arms.{name}: the SRDF has no group {name}_arm")

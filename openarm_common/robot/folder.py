@@ -35,7 +35,7 @@ class ArmParts(Config):
         flange: Link that the last of them moves; it carries the hand, cameras and boards.
         hand: Link that the fingers move on.
         tcp: Link of the tool centre point: z out of the fingers, y the opening direction.
-        finger_joint: That drives the fingers.
+        finger_joint: That drives the fingers; "": the arm has no hand, and is planned for alone.
         finger_sign: Of its positions, against those of the robot's hand.
         fingers: Their links; the pad of each is its collision shape `{link}_pad_collision`.
     """
@@ -45,14 +45,20 @@ class ArmParts(Config):
     flange: str
     hand: str
     tcp: str
-    finger_joint: str
+    finger_joint: str = ""
     finger_sign: Literal[-1, 1] = 1
-    fingers: tuple[str, ...] = Field(min_length=1)
+    fingers: tuple[str, ...] = ()
 
     @property
     def controlled(self) -> tuple[str, ...]:
         """Joints that are commanded: those of the arm, then the finger joint."""
-        return (*self.joints, self.finger_joint)
+        return (*self.joints, self.finger_joint) if self.finger_joint else self.joints
+
+    @model_validator(mode="after")
+    def _whole_hand(self) -> Self:
+        if bool(self.finger_joint) != bool(self.fingers):
+            raise ValueError("expected finger_joint and fingers, or neither of them")
+        return self
 
 
 class RobotFolder(Config):

@@ -86,7 +86,8 @@ def _pad_faults(parts: RobotFolder, robot: RobotDescription) -> Iterator[str]:
 
 
 def _group_faults(robot: RobotDescription) -> Iterator[str]:
-    wanted = [f"{arm}_gripper" for arm in robot.arms] + (["both_arms"] if len(robot.arms) == 2 else [])
+    wanted = [f"{name}_gripper" for name, arm in robot.arms.items() if arm.finger_joint]
+    wanted += ["both_arms"] if len(robot.arms) == 2 else []
     yield from (f"the SRDF has no group {group}" for group in wanted if group not in robot.semantics.groups)
     there = set(robot.semantics.states)
     homes = [(f"{arm}_arm", "home") for arm in robot.arms]

@@ -135,19 +135,21 @@ def _groups(description: RobotDescription) -> list[str]:
     followers = {
         name: [joint.name for joint in description.joints.values() if joint.mimic == arm.finger_joint]
         for name, arm in description.arms.items()
+        if arm.finger_joint
     }
     for name, arm in description.arms.items():
         chain = f'    <chain base_link="{arm.base}" tip_link="{arm.tcp}"/>'
         lines += [f'  <group name="{name}_arm">', chain, "  </group>"]
-    for name, arm in description.arms.items():
-        joints = [f'    <joint name="{joint}"/>' for joint in (arm.finger_joint, *followers[name])]
+    for name, others in followers.items():
+        joints = [f'    <joint name="{joint}"/>' for joint in (description.finger_joint(name), *others)]
         lines += [f'  <group name="{name}_gripper">', *joints, "  </group>"]
     if len(description.arms) == 2:
         lines += ['  <group name="both_arms">', *(f'    <group name="{name}_arm"/>' for name in description.arms)]
         lines.append("  </group>")
     lines += [
-        f'  <end_effector name="{name}_ee" parent_link="{arm.hand}" group="{name}_gripper" parent_group="{name}_arm"/>'
-        for name, arm in description.arms.items()
+        f'  <end_effector name="{name}_ee" parent_link="{description.arm(name).hand}" group="{name}_gripper"'
+        f' parent_group="{name}_arm"/>'
+        for name in followers
     ]
     return lines + [f'  <passive_joint name="{joint}"/>' for found in followers.values() for joint in found]
 
@@ -168,7 +170,7 @@ def _states(description: RobotDescription, source: SemanticsSource) -> list[str]
             lines += state(f"{arm}_arm", name, found[arm])
         if len(found) == len(description.arms) == 2:
             lines += state("both_arms", name, {joint: v for values in found.values() for joint, v in values.items()})
-    for arm in description.arm_names:
+    for arm in (name for name, parts in description.arms.items() if parts.finger_joint):
         for name, opening in source.gripper.items():
             value = opening[arm] if isinstance(opening, Mapping) else opening
             lines += state(f"{arm}_gripper", name, {description.finger_joint(arm): value})

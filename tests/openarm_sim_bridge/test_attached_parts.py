@@ -13,6 +13,11 @@ import yaml
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import read_folder
+from openarm_motion.config import LimitsConfig, MotionConfig
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.moves import RequestBoxes, to_joints
+from openarm_sim_bridge.drafting.check import folder_faults
 from openarm_sim_bridge.drafting.draft import draft_folder
 from openarm_sim_bridge.drafting.edits import Edits
 from openarm_sim_bridge.drafting.mesh_files import coarse_hull, write_stl
@@ -119,6 +124,24 @@ def test_what_is_not_there_is_named(parts: Path, wrong: dict[str, Any], words: s
             parts / "mine", parts / "arm.xml", {"mine": ("my_base", "my_tcp")}, parts / "edits.yaml", samples=5
         )
     assert caught.value.code is Code.CONFIG_INVALID
+
+
+@pytest.mark.requirement("B-13")
+def test_an_arm_without_a_hand_is_a_robot_to_plan_for(parts: Path) -> None:
+    edits = {"velocity": {"*": 2.0}, "frames": {"tool": {"parent": "upper", "xyz": [0, 0, 0.3]}}}
+    (parts / "edits.yaml").write_text(yaml.safe_dump(edits))
+    folder = parts / "bare"
+    draft_folder(folder, parts / "arm.xml", {"bare": ("base", "tool")}, parts / "edits.yaml", samples=5)
+    assert folder_faults(folder) == []
+    robot = RobotDescription.from_files(folder / "bare.urdf", folder / "bare.srdf").of_folder(
+        "bare", read_folder(folder)
+    )
+    assert (robot.arm("bare").controlled, robot.hands) == (("lift",), {})
+    with pytest.raises(OpenArmError, match="'bare' of robot 'bare' has no hand"):
+        robot.hand("bare")
+    config = MotionConfig(limits=LimitsConfig(velocity=(1.0,), acceleration=(3.0,), jerk=(30.0,)))
+    arm = Arm("bare", robot, config)
+    assert to_joints(arm, arm.start_state({"lift": 0.0}), [0.5], RequestBoxes()).q[-1].tolist() == [0.5]
 
 
 def test_a_coarse_hull_has_few_triangles_around_the_mesh() -> None:

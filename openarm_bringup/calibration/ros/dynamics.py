@@ -103,7 +103,7 @@ class DynamicsClient(MotionClient):
         description, arm = self._description, self._arms[side]
         load, logs = ArmLoad(description, arm.names, description.tcp_link(side)), list[ServoLog]()
         home = {n: q for s in description.arm_names for n, q in description.group_state(f"{s}_arm", "home").items()}
-        home |= {description.finger_joint(s): 0.0 for s in description.arm_names}
+        home |= {hand.joint: hand.closed for hand in description.hands.values()}
         collides = arm.scene(home, ()).collides
         lower, upper = description.limits(arm.names)
         chosen = postures(lower, upper, load, lambda q: not collides(q), count, np.random.default_rng(0))
