@@ -54,7 +54,7 @@ def test_the_matrix_is_symmetric_and_keeps_what_must_be_checked(robot):
     source = read_source(load_folder(robot.name)[0])
     image, why = mirror_links(robot), reasons(robot)
     assert {frozenset(map(image.__getitem__, pair)) for pair in why} == set(why)
-    assert len(source.checked(robot.arms)) > 50
+    assert len(source.checked(robot.arms)) > (50 if len(robot.arms) == 2 else 10)
     assert not set(why) & source.checked(robot.arms)
     assert {pair for pair, reason in why.items() if reason == "Adjacent"} == adjacent_pairs(robot)
     assert source.allowed(robot.arms) <= set(why)
@@ -64,13 +64,20 @@ def test_the_matrix_is_symmetric_and_keeps_what_must_be_checked(robot):
 def test_no_pair_that_is_said_never_to_touch_does(robot):
     never = {pair for pair, reason in reasons(robot).items() if reason == "Never"}
     touching = LinkContacts(robot).touching(1500, seed=7)
-    assert len(never) > 50
-    assert len(touching) > 30
+    assert len(never) > (50 if len(robot.arms) == 2 else 20)
+    assert len(touching) > (30 if len(robot.arms) == 2 else 15)
     assert not never & touching
 
 
-def test_each_link_of_an_arm_has_one_image_on_the_other(robot):
-    image = mirror_links(robot)
+@pytest.fixture
+def mirrored(robot: RobotDescription) -> RobotDescription:
+    if not robot.mirror:
+        pytest.skip("its arms are no mirror images")
+    return robot
+
+
+def test_each_link_of_an_arm_has_one_image_on_the_other(mirrored):
+    robot, image = mirrored, mirror_links(mirrored)
     assert {image[image[link]] == link for link in robot.links} == {True}
     for arm in robot.arms:
         assert {robot.arm_of(image[link]) for link in robot.links_of(arm)} == set(robot.arms) - {arm}
@@ -100,7 +107,8 @@ def test_links_that_must_be_checked_stay_so_though_they_never_touch():
         classify(RobotDescription.from_urdf(LEVER), SemanticsSource(postures={}, may_touch=(("roof", "lever"),)))
 
 
-def test_mirrored_postures_are_mirror_images(robot):
+def test_mirrored_postures_are_mirror_images(mirrored):
+    robot = mirrored
     zero = dict.fromkeys(robot.joints, 0.0)
     (first, second), image = robot.arm_names, mirror_links(robot)
     for group, name in robot.semantics.states:
