@@ -14,7 +14,7 @@ import pytest
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import ROBOT, load_folder
-from openarm_common.scene.scene import Scene, SceneObject
+from openarm_common.scene.scene import Scene, SceneObject, load_scene
 from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import Task
@@ -40,6 +40,9 @@ def robot(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ro
 @pytest.mark.requirement("B-13")
 def test_nothing_is_wrong_with_the_folder(robot: RobotDescription) -> None:
     assert folder_faults(load_folder(robot.name)[0]) == []
+    for name in ("demo", "calibration_overhead", "calibration_wrist"):
+        scene = load_scene(name)
+        assert bool(scene.objects) == (name == "demo")
 
 
 @pytest.mark.requirement("B-13")
