@@ -32,8 +32,9 @@ class JointReadout:
 
 
 def joint_names(description: RobotDescription) -> tuple[str, ...]:
-    """Return the controlled joints: of each arm its own, then the driving finger joint."""
-    return tuple(name for arm in description.arms.values() for name in arm.controlled)
+    """Return the controlled joints: of each arm its own, then the driving finger joint; at last the lift."""
+    lift = () if description.lift is None else (description.lift.joint,)
+    return (*(name for arm in description.arms.values() for name in arm.controlled), *lift)
 
 
 def arm_groups(description: RobotDescription) -> dict[str, JointGroup]:

@@ -58,5 +58,6 @@ class GraspContext:
 def _shoulder(robot: RobotDescription, arm: str) -> tuple[float, float]:
     """(x, y) of the arm's first joint, base frame, m."""
     first = robot.joint(robot.arm_joints(arm)[0])
-    T_base_shoulder = robot.link_pose(first.parent, {}) @ first.T_parent_joint
+    anyhow = dict.fromkeys(robot.joints, 0.0)  # a lift changes neither
+    T_base_shoulder = robot.link_pose(first.parent, anyhow) @ first.T_parent_joint
     return float(T_base_shoulder[0, 3]), float(T_base_shoulder[1, 3])

@@ -23,6 +23,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import is_file
 from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, robot_name
 from openarm_common.robot.hand import Hand
+from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.meshes import take_meshes
 from openarm_common.robot.motors import JointMotion, Motors
 from openarm_common.robot.srdf import Semantics, parse_srdf
@@ -48,6 +49,7 @@ class RobotDescription:
         base: Base frame.
         arms: By name.
         hands: By arm.
+        lift: That carries all arms; None: they stand on the base.
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
         motion: What plans ask of the joints of an arm, where its folder says it.
         motors: Of each arm, where its folder says them.
@@ -64,6 +66,7 @@ class RobotDescription:
     base: str = ""
     arms: Mapping[str, ArmParts] = field(default_factory=dict[str, ArmParts])
     hands: Mapping[str, Hand] = field(default_factory=dict[str, Hand])
+    lift: LiftParts | None = None
     mirror: tuple[float, ...] = ()
     motion: JointMotion | None = None
     motors: Motors | None = None
@@ -154,8 +157,32 @@ class RobotDescription:
         hand, arms = parts.hand, parts.arms
         moved = {key: arm for key, arm in arms.items() if hand is not None and arm.finger_joint}
         hands = {key: Hand(arm.finger_joint, arm.finger_sign, hand) for key, arm in moved.items()} if hand else {}
-        said = {"mirror": parts.mirror, "motion": parts.motion, "motors": parts.motors}
+        said = {"mirror": parts.mirror, "motion": parts.motion, "motors": parts.motors, "lift": parts.lift}
         return replace(self, name=name, base=parts.base, arms=arms, hands=hands, **said)
+
+    def with_fixed(self, name: str, position: float) -> RobotDescription:
+        """Return the robot with a joint that slides fixed at a position, m; it has no lift if that is the joint.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, as `joint`, and for one that does not slide.
+        """
+        old = self.joint(name)
+        if old.type != "prismatic":
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"joint {name!r} is {old.type}, expected one that slides")
+        fixed = replace(old, type="fixed", T_parent_joint=old.T_parent_joint @ old.motion(position))
+        root = parse_root(self.urdf, "urdf")
+        element = next(joint for joint in root.findall("joint") if joint.get("name") == name)
+        element.set("type", "fixed")
+        origin = element.find("origin")
+        origin = ET.SubElement(element, "origin") if origin is None else origin
+        origin.set("xyz", " ".join(map(repr, fixed.T_parent_joint[:3, 3].tolist())))
+        return replace(
+            self,
+            urdf=ET.tostring(root, encoding="unicode"),
+            joints=MappingProxyType({**self.joints, name: fixed}),
+            _chains=MappingProxyType({k: tuple(fixed if j is old else j for j in c) for k, c in self._chains.items()}),
+            lift=None if self.lift is not None and self.lift.joint == name else self.lift,
+        )
 
     @property
     def arm_names(self) -> tuple[str, ...]:
@@ -347,6 +374,23 @@ def part_faults(parts: RobotFolder, robot: RobotDescription) -> list[str]:
         faults += [f"arms.{name}: no joint {joint!r}" for joint in joints if joint not in robot.joints]
         if f"{name}_arm" not in robot.semantics.groups:
             faults.append(f"arms.{name}: the SRDF has no group {name}_arm")
+    return faults + _lift_faults(parts, robot)
+
+
+def _lift_faults(parts: RobotFolder, robot: RobotDescription) -> list[str]:
+    lift = parts.lift
+    if lift is None:
+        return []
+    if lift.joint not in robot.joints or robot.joints[lift.joint].type != "prismatic":
+        return [f"lift: no joint {lift.joint!r} that slides"]
+    joint = robot.joints[lift.joint]
+    faults = [
+        f"lift: does not carry arm {name}, whose base is {arm.base!r}"
+        for name, arm in parts.arms.items()
+        if arm.base in robot.links and joint not in robot.chain(arm.base)
+    ]
+    if not joint.lower <= lift.home <= joint.upper:
+        faults.append(f"lift.home: {lift.home:g} m, expected {joint.lower:g} .. {joint.upper:g}")
     return faults
 
 

@@ -15,6 +15,7 @@ from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_common.robot.hand import HandParts
+from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.motors import JointMotion, Motors
 from openarm_common.robot.work import Work
 
@@ -74,6 +75,7 @@ class RobotFolder(Config):
         motion: What plans ask of the joints of an arm; None: parameters of the motion node say it.
         motors: Of each arm; None: it is not simulated.
         arms: By name; the group of each in the SRDF is `NAME_arm`.
+        lift: That carries all arms; None: they stand on the base.
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
         work: Where it works; None: it has no table, and no scenes.
     """
@@ -87,6 +89,7 @@ class RobotFolder(Config):
     motion: JointMotion | None = None
     motors: Motors | None = None
     arms: Mapping[str, ArmParts] = Field(min_length=1)
+    lift: LiftParts | None = None
     mirror: tuple[float, ...] = ()
     work: Work | None = None
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from openarm_common import se3
-from openarm_common.camera.cameras import CameraConfig, detector_nodes, load_cameras
+from openarm_common.camera.cameras import CameraConfig, detector_nodes, load_cameras, stereo_pairs
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.camera.housings import mounted
 from openarm_common.config import Config, load_config
@@ -38,6 +38,7 @@ from openarm_control.trajectory import Trajectory as FollowedTrajectory
 from openarm_control.trajectory import TrajectoryError
 from openarm_evaluation.campaign.map_feed import SimulatedMap
 from openarm_evaluation.campaign.parameters import suite_config
+from openarm_evaluation.campaign.stereo import stereo_depth
 from openarm_evaluation.judging.judge import Sample
 from openarm_grasp.perception.detections import Frame
 from openarm_motion.config import FaultsConfig, MotionConfig
@@ -135,7 +136,7 @@ class SimRobot:
         self._rng = np.random.default_rng([seed, 77])
         noise = (bridge.depth_noise, bridge.colour_noise)
         self._drawing = SimulatedCameras(shared_renderer, self.cameras, *noise, self._rng)
-        self.camera_faults = self._drawing.faults
+        self.camera_faults, self._pairs = self._drawing.faults, stereo_pairs()
         self.states = RobotStateBuffer(self.description)
         self.efforts: dict[str, float] = {}
         self.tracks: dict[str, list[Sample]] = {item.name: [] for item in scene.objects}
@@ -356,6 +357,8 @@ class SimRobot:
         rgb = np.empty((camera.height, camera.width, 3), np.uint8)
         depth = np.empty((camera.height, camera.width), np.uint16)
         self._drawing.draw(name, rgb, depth if camera.depth else None)
+        if name in self._pairs:
+            depth = stereo_depth(name, rgb, self.draw(self._pairs[name])[0])
         self.images[name] = (self.t_ns, rgb, depth)
         return rgb, depth
 

@@ -26,6 +26,7 @@ from openarm_motion.planning.alternative import explained, explained_approach, n
 from openarm_motion.planning.approach import ApproachPlan, plan_approach
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.dual_arm import DualArm, DualArmGoals, DualArmPlan, plan_any, plan_staggered, plan_together
+from openarm_motion.planning.lift import LiftedArms
 from openarm_motion.planning.moves import goal_configurations, named_posture, yielding
 from openarm_motion.planning.planner import never
 from openarm_motion.scene.held import HeldObjects
@@ -84,8 +85,8 @@ def make_arms(
     description: RobotDescription,
     fixed: Sequence[Box],
     cameras: Mapping[str, CameraConfig] | None = None,
-) -> dict[str, Arm]:
-    """Make the arms of a robot with its cameras mounted.
+) -> Mapping[str, Arm]:
+    """Make the arms of a robot with its cameras mounted; those on a lift are of the height that it is at.
 
     Args:
         config: Parameters.
@@ -94,7 +95,12 @@ def make_arms(
         cameras: By name, at their mounts; None: those of this process's robot, where the configuration says.
     """
     body = with_housings(description, (load_cameras() if cameras is None else cameras).values())
-    return {name: Arm(name, body, config, fixed) for name in config.arms or body.arm_names}
+    names = config.arms or body.arm_names
+
+    def make(robot: RobotDescription) -> dict[str, Arm]:
+        return {name: Arm(name, robot, config, fixed) for name in names}
+
+    return make(body) if body.lift is None else LiftedArms(body, make)
 
 
 class MotionService:
@@ -392,6 +398,7 @@ class MotionService:
         return lambda now: goal_configurations(arm, now, start, pose, position_only=free)
 
     def _two_arms(self, targets: Sequence[ArmGoal]) -> tuple[Arm, Arm]:
+        self._follow_lift()
         names = [target.arm for target in targets]
         if len(names) != 2 or len(set(names)) != 2 or any(name not in self.arms for name in names):
             raise OpenArmError(
@@ -401,7 +408,13 @@ class MotionService:
             )
         return self.arms[names[0]], self.arms[names[1]]
 
+    def _follow_lift(self) -> None:
+        """Plan from now on for the height that was measured last."""
+        if isinstance(self.arms, LiftedArms) and self.robot.state_age() < float("inf"):
+            self.arms.follow(self.robot.states.latest()[1])
+
     def _arm(self, name: str) -> Arm:
+        self._follow_lift()
         if name not in self.arms:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"arm is {name!r}; arms: {', '.join(self.arms)}")
         return self.arms[name]

@@ -67,7 +67,11 @@ def draft_folder(
     folder.mkdir(parents=True, exist_ok=True)
     urdf = folder / f"{folder.name}.urdf"
     if source.suffix == ".xml":
-        draft = UrdfDraft(folder.name, compiled(source, wanted), wanted)
+        shared = folder.parent / wanted.meshes if wanted.meshes else None
+        if shared is not None and not (shared / "robot.yaml").is_file():
+            text = f"{edits}:meshes: there is no robot {wanted.meshes[:80]!r} next to {folder}"
+            raise OpenArmError(Code.CONFIG_INVALID, text)
+        draft = UrdfDraft(folder.name, compiled(source, wanted), wanted, shared)
         draft.meshes.write(folder, wanted.triangles, wanted.detail)
         urdf.write_text(draft.text().replace("\n", f"\n{_LICENCE}", 1), encoding="utf-8")
     else:

@@ -112,6 +112,7 @@ class Edits(Config):
         materials: rgba of those of boxes.
         triangles: Of all visual meshes together, at most.
         detail: Weight by visual mesh file: the greater, the more of its triangles stay.
+        meshes: Robot whose mesh files are taken where name and extents are the same; "": none.
     """
 
     base: str = "base_link"
@@ -133,6 +134,7 @@ class Edits(Config):
     materials: Mapping[str, tuple[float, float, float, float]] = Field(default_factory=dict)
     triangles: int = Field(default=60_000, ge=1000)
     detail: Mapping[str, float] = Field(default_factory=dict)
+    meshes: str = ""
 
 
 def matches(patterns: Iterable[str], name: str) -> bool:

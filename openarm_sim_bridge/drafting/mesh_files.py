@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.meshes import read_mesh
 from openarm_common.types import Array
 from openarm_sim_bridge.drafting.collisions import hull_mesh
 from openarm_sim_bridge.drafting.edits import matching
@@ -27,6 +28,8 @@ _ATTEMPTS = ((2, 1e-6), (5, 1e-6), (5, 5e-4), (8, 1e-3), (8, 2e-3))
 _ENOUGH = 1.2
 #: Most triangles of the hull around a mesh that is made to be seen, and grids that its corners move to, m.
 _HULL_FACES, _GRIDS = 300, (0.001, 0.002, 0.003, 0.004, 0.006, 0.008, 0.012)
+#: Extents of a mesh and of its simplification differ by less, m.
+_ALIKE = 0.002
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -44,10 +47,12 @@ class MeshFiles:
 
     Args:
         model: Compiled from an MJCF.
+        shared: Folder next to the robot's, of one whose files are taken where name and extents are the same.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self._model = model
+    def __init__(self, model: mujoco.MjModel, shared: Path | None = None) -> None:
+        self._model, self._shared = model, shared
+        self._names: set[str] = set()
         self._files: dict[str, tuple[Array, Triangles]] = {}
         self._sources: dict[tuple[str, tuple[float, ...]], str] = {}
         self._uses: dict[str, int] = {}
@@ -68,7 +73,6 @@ class MeshFiles:
         file = self._sources.get((path, (*np.abs(scale), seen)))
         if file is None:
             file = self._name(Path(path).stem, seen)
-            self._sources[path, (*np.abs(scale), seen)] = file
             first, count = int(model.mesh_vertadr[k]), int(model.mesh_vertnum[k])
             vertices = se3.apply(T_file_mesh, np.array(model.mesh_vert[first : first + count], np.float64))
             vertices *= np.sign(scale)
@@ -77,7 +81,12 @@ class MeshFiles:
             if np.prod(scale) < 0.0:
                 triangles = triangles[:, ::-1]  # MuJoCo has turned them
             hull = coarse_hull if coarse else hull_mesh
-            self._files[file] = (vertices, triangles) if seen else hull(np.unique(vertices, axis=0))
+            found = (vertices, triangles) if seen else hull(np.unique(vertices, axis=0))
+            if self._shared is not None and _alike(self._shared / file, found[0]):
+                file = f"../{self._shared.name}/{file}"
+            else:
+                self._files[file] = found
+            self._sources[path, (*np.abs(scale), seen)] = file
         self._uses[file] = self._uses.get(file, 0) + 1
         return PlacedMesh(file, T, np.sign(scale))
 
@@ -110,9 +119,9 @@ class MeshFiles:
 
     def _name(self, stem: str, seen: bool) -> str:
         """A file of a name of its own: MuJoCo reads a URDF's meshes by the last part of their paths."""
-        taken = {Path(file).stem for file in self._files}
         stem = stem if seen else f"{stem}_hull"
-        number = next(n for n in range(len(taken) + 1) if (f"{stem}_{n}" if n else stem) not in taken)
+        number = next(n for n in range(len(self._names) + 1) if (f"{stem}_{n}" if n else stem) not in self._names)
+        self._names.add(f"{stem}_{number}" if number else stem)
         return f"meshes/{'visual' if seen else 'collision'}/{f'{stem}_{number}' if number else stem}.stl"
 
 
@@ -127,6 +136,15 @@ def coarse_hull(points: Array) -> tuple[Array, Triangles]:
         moved = middle + np.sign(away) * np.ceil(np.abs(away) / cell) * cell
         out = hull_mesh(np.unique(moved.round(6), axis=0))
     return out
+
+
+def _alike(file: Path, vertices: Array) -> bool:
+    """Whether there is such a mesh file, of the extents of these vertices (n, 3)."""
+    if not file.is_file():
+        return False
+    there, _ = read_mesh(file, np.ones(3))
+    extents = np.array([vertices.min(axis=0), vertices.max(axis=0)])
+    return bool(np.abs(extents - [there.min(axis=0), there.max(axis=0)]).max() < _ALIKE)
 
 
 def write_stl(path: Path, vertices: Array, triangles: Triangles) -> None:

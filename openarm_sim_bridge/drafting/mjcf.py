@@ -80,13 +80,14 @@ class UrdfDraft:
         name: Of the robot.
         model: Its bodies have at most one joint each, a hinge or slide.
         edits: What is not in the MJCF.
+        shared: As for `MeshFiles`.
 
     Raises:
         OpenArmError: CONFIG_INVALID, naming each joint that a URDF cannot have, and each name of the edits that the
             model does not have.
     """
 
-    def __init__(self, name: str, model: mujoco.MjModel, edits: Edits) -> None:
+    def __init__(self, name: str, model: mujoco.MjModel, edits: Edits, shared: Path | None = None) -> None:
         self._model, self._edits = model, edits
         self._names = [edits.base, *(model.body(k).name or f"body{k}" for k in range(1, model.nbody))]
         self._offsets = np.zeros((model.nbody, 3))
@@ -95,7 +96,7 @@ class UrdfDraft:
         leaders = {leader for leader, _, _ in given.values()}
         self._mimics = {name: row for name, row in _mimics(model).items() if name not in leaders} | given
         self._refuse()
-        self.meshes = MeshFiles(model)
+        self.meshes = MeshFiles(model, shared)
         self._root = ET.Element("robot", name=name)
         ET.SubElement(self._root, "link", name=_ROOT)
         self._build()

@@ -23,6 +23,7 @@ from openarm_common.camera.cameras import CameraConfig
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.xml_text import floats
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
@@ -151,6 +152,8 @@ def robot_spec(
     for side in description.arm_names:
         _actuate_arm(spec, description, side, hardware)
         _actuate_gripper(spec, description, side, physics)
+    if description.lift is not None:
+        _actuate_lift(spec, description, description.lift)
     for body in spec.bodies:
         if body.name in hardware.mass:
             # MuJoCo looks at no body's compensation where all are 0 at first; faults change it later
@@ -246,6 +249,13 @@ def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: str, 
         _mount_softly(spec.body(description.arm(side).hand), hardware.tool_stiffness)
     tcp = description.tcp_link(side)
     spec.body(tcp).add_site(name=tcp, size=(0.004, 0.004, 0.004), group=4)
+
+
+def _actuate_lift(spec: mujoco.MjSpec, description: RobotDescription, lift: LiftParts) -> None:
+    joint = description.joints[lift.joint]
+    spec.joint(lift.joint).actfrclimited = False
+    servo = _add_servo(spec, lift.joint, lift.stiffness, lift.damping, joint.effort)
+    servo.ctrlrange = (joint.lower, joint.upper)
 
 
 def _mount_softly(hand: mujoco.MjsBody, stiffness: float) -> None:

@@ -49,6 +49,8 @@ class Stage:
         self.joint_names = joint_names(description)
         self.encoders = made.encoders(description, self.joint_names)
         self.home: dict[str, float] = {}
+        if description.lift is not None:
+            self.home[description.lift.joint] = description.lift.home
         for side in description.arm_names:
             self.home |= description.group_state(f"{side}_arm", "home") | {
                 description.finger_joint(side): description.hand(side).closed

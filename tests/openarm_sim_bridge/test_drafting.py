@@ -282,23 +282,39 @@ def test_triangles_are_shared_by_weight_and_never_more_than_allowed():
     assert _budgets(meshes, 50_000) == {"a": 10_000, "b": 10_000, "c": 30}
 
 
-V2 = models_dir() / "robots" / "openarm_v2"
+ROBOTS = {"openarm_v2": "pedestal/openarm_pedestal.xml", "openarm_v2_cell": "cell/cell.xml"}
 
 
-@pytest.fixture(scope="module")
-def maker() -> mujoco.MjModel:
-    """The maker's model of OpenArm v2."""
-    return compiled(mesh_file("package://openarm_mujoco/v2/pedestal/openarm_pedestal.xml", V2 / "openarm_v2.urdf"))
+@pytest.fixture(scope="module", params=list(ROBOTS))
+def drafted(request: pytest.FixtureRequest) -> tuple[Path, mujoco.MjModel]:
+    """Folder of a robot of the maker of OpenArm, and the maker's model of it."""
+    folder = models_dir() / "robots" / request.param
+    file = mesh_file(f"package://openarm_mujoco/v2/{ROBOTS[request.param]}", folder / f"{request.param}.urdf")
+    return folder, compiled(file)
 
 
 @pytest.mark.requirement("B-07", "R-04")
-def test_openarm_v2_moves_as_its_maker_s_model(maker):
-    assert_same_motion(maker, RobotDescription.load("openarm_v2").urdf)
+def test_openarm_v2_moves_as_its_maker_s_model(drafted):
+    folder, maker = drafted
+    assert_same_motion(maker, RobotDescription.load(folder.name).urdf)
 
 
-def test_the_urdf_of_openarm_v2_is_drafted_from_its_maker_s_model(maker):
-    edits = Edits.model_validate(yaml.safe_load((V2 / "edits.yaml").read_text()))
-    head, rest = UrdfDraft("openarm_v2", maker, edits).text().split("\n", 1)
-    text = (V2 / "openarm_v2.urdf").read_text()
+def test_the_urdf_of_openarm_v2_is_drafted_from_its_maker_s_model(drafted):
+    """That of the Cell with the mesh files of openarm_v2, of which it has no copy."""
+    folder, maker = drafted
+    edits = Edits.model_validate(yaml.safe_load((folder / "edits.yaml").read_text()))
+    shared = folder.parent / edits.meshes if edits.meshes else None
+    draft = UrdfDraft(folder.name, maker, edits, shared)
+    head, rest = draft.text().split("\n", 1)
+    text = (folder / f"{folder.name}.urdf").read_text()
     assert text.startswith(head)
     assert text.endswith(rest)
+    assert (folder / "meshes").exists() == (shared is None)
+
+
+def test_a_robot_whose_meshes_are_wanted_must_be_there(tmp_path):
+    edits = tmp_path / "edits.yaml"
+    edits.write_text("meshes: openarm_v9")
+    source = models_dir() / "boards" / "circles_4x11.xml"
+    with pytest.raises(OpenArmError, match=r"edits.yaml:meshes: there is no robot 'openarm_v9' next to"):
+        draft_folder(tmp_path / "mine", source, ARMS, edits)

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `stereo_depth`: pairs of images to depth images that other nodes take."""
+
+from __future__ import annotations
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.errors import OpenArmError
+from openarm_common.robot.folder import ROBOT
+from openarm_common.ros.convert import (
+    array_to_image,
+    depth_image,
+    info_from_intrinsics,
+    intrinsics_from_info,
+    points_from_cloud,
+    stamp_to_ns,
+)
+from openarm_common.ros.node import QOS_SENSOR
+from openarm_perception.ros.cloud_node import CloudNode
+from openarm_perception.ros.stereo_node import StereoNode
+
+#: Disparity of the wall that is seen, pixels.
+SHIFT = 40
+
+
+@pytest.fixture(autouse=True)
+def cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The robot with a stereo head."""
+    monkeypatch.setenv(ROBOT, "openarm_v2_cell")
+
+
+class Bench:
+    """Both cameras of a pair before a textured wall, the node, and what it says."""
+
+    def __init__(self, ros, **params) -> None:
+        self.ros = ros
+        self.left, self.right = load_cameras()["head_left"], load_cameras()["head_right"]
+        self.depth_of_wall = self.left.intrinsics.fx * self.right.baseline / SHIFT
+        rng = np.random.default_rng(1)
+        wall = cv2.resize(rng.integers(0, 255, (160, 240), dtype=np.uint8), (720, 480), interpolation=cv2.INTER_CUBIC)
+        self.images = {c.name: np.repeat(w[..., None], 3, axis=2) for c, w in self._views(wall)}
+        make = ros.node.create_publisher
+        self.publishers = {
+            camera.name: (
+                make(Image, f"/{camera.name}/color/image_raw", QOS_SENSOR),
+                make(CameraInfo, f"/{camera.name}/color/camera_info", QOS_SENSOR),
+            )
+            for camera in (self.left, self.right)
+        }
+        overrides = [Parameter(name, value=value) for name, value in params.items()]
+        self.node = ros.add(StereoNode(parameter_overrides=overrides))
+        self.t_ns = 0
+        self.baseline = self.right.baseline
+        self.reports: list[str] = []
+        ros.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
+
+    def _views(self, wall):
+        return (self.left, wall[:, :640]), (self.right, np.ascontiguousarray(wall[:, SHIFT : SHIFT + 640]))
+
+    def _hear(self, message) -> None:
+        self.reports += [s.message for s in message.status if s.name.startswith("stereo_depth")]
+
+    def hear(self, kind: type, topic: str) -> list:
+        got: list = []
+        self.ros.node.create_subscription(kind, topic, got.append, QOS_SENSOR)
+        return got
+
+    def pump(self, condition, what: str, apart_ns: int = 0) -> None:
+        """Publish a pair each quarter of a second (best effort may lose one) until `condition` holds."""
+        due = 0.0
+
+        def step() -> bool:
+            nonlocal due
+            if time.monotonic() >= due:
+                due = time.monotonic() + 0.25
+                self.t_ns += 250_000_000
+                for camera in (self.left, self.right):
+                    t_ns = self.t_ns + (apart_ns if camera is self.right else 0)
+                    image, info = self.publishers[camera.name]
+                    baseline = self.baseline if camera is self.right else 0.0
+                    info.publish(info_from_intrinsics(camera.intrinsics, camera.optical_frame, t_ns, baseline))
+                    image.publish(array_to_image(self.images[camera.name], "rgb8", camera.optical_frame, t_ns))
+            return condition()
+
+        self.ros.spin_until(step, 15.0, what)
+
+
+@pytest.mark.requirement("R-04")
+def test_depth_of_a_pair_is_what_the_cloud_node_takes(ros) -> None:
+    """Depth, CameraInfo and cloud at the stamp of the left image, in its frame; the margin it alone sees is invalid."""
+    bench = Bench(ros)
+    ros.add(CloudNode(parameter_overrides=[Parameter("cameras", value=["head_left"])]))
+    depths, infos = (
+        bench.hear(Image, "/head_left/depth/image_raw"),
+        bench.hear(CameraInfo, "/head_left/depth/camera_info"),
+    )
+    clouds = bench.hear(PointCloud2, "/head_left/depth/points")
+    bench.pump(lambda: depths and infos and clouds, "depth and a cloud")
+    depth = depth_image(depths[0])
+    assert (depths[0].encoding, depths[0].header.frame_id) == ("16UC1", bench.left.optical_frame)
+    assert stamp_to_ns(depths[0].header.stamp) % 250_000_000 == 0
+    k = intrinsics_from_info(infos[0])
+    assert (k.width, k.height, k.fx, k.cx) == pytest.approx((640, 480, bench.left.intrinsics.fx, 319.5))
+    assert np.median(depth[:, SHIFT + 10 :]) == pytest.approx(1e3 * bench.depth_of_wall, abs=6.0)
+    assert np.count_nonzero(depth[:, SHIFT + 10 :]) > 0.95 * depth[:, SHIFT + 10 :].size
+    assert np.count_nonzero(depth[:, : SHIFT - 5]) < 0.2 * depth[:, : SHIFT - 5].size
+    points = points_from_cloud(clouds[0])
+    assert np.nanmedian(points[..., 2]) == pytest.approx(bench.depth_of_wall, abs=0.006)
+
+
+@pytest.mark.requirement("R-04")
+def test_a_pair_without_a_baseline_is_refused_with_the_reason_until_it_has_one(ros) -> None:
+    bench = Bench(ros, encoding="32FC1", stamp_gap=0.01)
+    depths = bench.hear(Image, "/head_left/depth/image_raw")
+    bench.baseline = 0.0
+    bench.pump(lambda: any("the baseline is" in text for text in bench.reports), "the reason", apart_ns=3_000_000)
+    assert not depths
+    bench.baseline = bench.right.baseline
+    bench.pump(lambda: depths, "depth", apart_ns=3_000_000)
+    assert np.nanmedian(depth_image(depths[0])) == pytest.approx(bench.depth_of_wall, abs=0.006)
+
+
+def test_it_listens_only_while_its_depth_is_wanted(ros) -> None:
+    bench = Bench(ros)
+    image, _ = bench.publishers["head_left"]
+    ros.spin_until(lambda: "idle: no subscribers" in bench.reports, 10.0, "a report")
+    assert image.get_subscription_count() == 0
+    wanted = ros.node.create_subscription(Image, "/head_left/depth/image_raw", lambda _: None, QOS_SENSOR)
+    ros.spin_until(lambda: image.get_subscription_count() == 1, 10.0, "a subscription")
+    ros.node.destroy_subscription(wanted)
+    ros.spin_until(lambda: image.get_subscription_count() == 0, 10.0, "its end")
+
+
+def test_a_camera_that_is_no_left_one_is_refused_with_those_that_are(ros) -> None:
+    with pytest.raises(OpenArmError, match="left cameras: head_left"):
+        StereoNode(parameter_overrides=[Parameter("camera", value="ceiling")])

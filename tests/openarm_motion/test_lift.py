@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arms on a lift: all that plans is of the height that was measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from openarm_common import se3
+from openarm_common.errors import OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import ROBOT
+from openarm_common.scene.scene import Scene
+from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
+from openarm_motion.collision.fast import FastScene
+from openarm_motion.collision.solids import box_from
+from openarm_motion.config import MotionConfig
+from openarm_motion.planning.lift import LiftedArms
+from openarm_motion.service.motion_service import make_arms
+from openarm_motion.service.requests import MoveRequest, PoseGoal
+
+ROBOT_NAME = "openarm_v2_cell"
+LIFT = "openarm_lifter_joint"
+SIDE = "right"
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotDescription:
+    return RobotDescription.load(ROBOT_NAME)
+
+
+@pytest.fixture(scope="module")
+def home(robot) -> dict[str, float]:
+    postures = [robot.group_state(f"{arm}_arm", "home") for arm in robot.arm_names]
+    closed = {robot.finger_joint(arm): 0.0 for arm in robot.arm_names}
+    return {name: value for posture in (*postures, closed) for name, value in posture.items()}
+
+
+@pytest.fixture(scope="module")
+def arms(robot) -> LiftedArms:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(ROBOT, ROBOT_NAME)
+        made = make_arms(MotionConfig(), robot, [])
+    assert isinstance(made, LiftedArms)
+    return made
+
+
+@given(st.floats(0.0, 0.3))
+@settings(max_examples=20)
+def test_a_robot_at_a_height_has_the_poses_of_one_whose_lift_is_there(height: float) -> None:
+    robot = RobotDescription.load(ROBOT_NAME)
+    fixed = robot.with_fixed(LIFT, height)
+    q = dict.fromkeys(robot.joints, 0.3)
+    again = RobotDescription.from_urdf(fixed.urdf)
+    assert fixed.lift is None
+    assert fixed.joints[LIFT].type == again.joints[LIFT].type == "fixed"
+    expected = robot.link_poses(q | {LIFT: height})
+    for made in (fixed.link_poses(q), again.link_poses(q)):
+        assert max(np.abs(made[link] - expected[link]).max() for link in expected) < 1e-12
+
+
+def test_only_what_slides_is_fixed_so(robot) -> None:
+    with pytest.raises(OpenArmError, match="openarm_left_joint1' is revolute, expected one that slides"):
+        robot.with_fixed("openarm_left_joint1", 0.0)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.137, 0.22])
+def test_kinematics_and_collisions_are_those_of_the_measured_height(robot, home, arms, height) -> None:
+    """FK and closed form as the robot's own kinematics has them; a box before the hand is hit at its height alone."""
+    state = home | {LIFT: height}
+    arms.follow(state)
+    arm = arms[SIDE]
+    q = np.array([state[name] for name in arm.names])
+    pose = robot.link_pose(robot.tcp_link(SIDE), state)
+    assert arms.height == pytest.approx(height, abs=2.6e-4)
+    assert arm.inverse.method == "closed form"
+    shift = se3.make(None, (0.0, 0.0, arms.height - height))
+    np.testing.assert_allclose(arm.kinematics.fk(q), shift @ pose, atol=1e-9)
+    assert min(np.abs(found.q - q).max() for found in arm.inverse.solutions(shift @ pose, near=q)) < 1e-3
+    here, above = (box_from("box", tuple(pose[:3, 3] + (0.0, 0.0, up)), (0.04, 0.04, 0.04)) for up in (0.0, 0.25))
+    for boxes, hit in (([], False), ([here], True), ([above], False)):
+        scene = arm.scene(state, boxes)
+        assert scene.collides(q) == hit
+        assert FastScene([scene]).free_many(q[None])[0] == (not hit)
+
+
+def test_arms_stay_those_of_a_height_that_is_near_enough_or_not_known(home, arms) -> None:
+    arms.follow(home | {LIFT: 0.2})
+    first = arms[SIDE]
+    for state in (home, home | {LIFT: 0.2004}):
+        arms.follow(state)
+        assert arms[SIDE] is first
+    arms.follow(home | {LIFT: 0.1})
+    assert arms[SIDE] is not first
+    arms.follow(home | {LIFT: 0.2})
+    assert arms[SIDE] is first  # what was made is kept
+
+
+@pytest.mark.requirement("R-04")
+def test_the_tool_goes_to_a_pose_in_the_base_frame_at_any_height(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planned from measured joints, carried out by the simulated robot, seen in the simulation itself."""
+    monkeypatch.setenv(ROBOT, ROBOT_NAME)
+    senses = SimulatedSenses(depth_noise=False, sets=("motion.map.use=off", "mujoco_bridge.profile=ideal"))
+    robot = SimRobot(Scene(name="empty"), senses, posture={LIFT: 0.12})
+    robot.pass_time(0.2)
+    down = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.42, -0.25, 1.30))
+    work = robot.motion.move(MoveRequest(SIDE, PoseGoal(down)))
+    answer = None
+    while answer is None:
+        try:
+            work.send(None)
+            robot.tick()
+        except StopIteration as end:
+            answer = end.value
+    assert answer.error is None, answer.message
+    robot.pass_time(0.5)
+    site = robot.world.data.site(robot.description.tcp_link(SIDE))
+    assert np.linalg.norm(site.xpos - down[:3, 3]) < 0.003
+    assert robot.world.data.joint(LIFT).qpos[0] == pytest.approx(0.12, abs=0.001)
