@@ -141,7 +141,8 @@ class Bench:
     def _on_table(self, arm: str) -> Array:
         """Where the board lies for the camera on the hand of an arm, (4, 4)."""
         work = robot_work()
-        shoulder = float(self._description.link_pose(self._description.arm(arm).base, {})[1, 3])
+        anyhow = dict.fromkeys(self._description.joints, 0.0)  # a lift does not change it
+        shoulder = float(self._description.link_pose(self._description.arm(arm).base, anyhow)[1, 3])
         y = np.sign(shoulder) * _ASIDE if abs(shoulder) > _MIDDLE else 0.0
         place = (round(work.region.x[1] - _BEFORE, 3), y, round(work.table.top_z + _ABOVE, 3))
         return se3.make(se3.rotation_from_z_y((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)), place)
