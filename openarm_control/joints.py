@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.lift import LIFT
 from openarm_common.robot.servos import ArmLoad, ServoModel
 from openarm_common.types import Array
 from openarm_control.carrier import Carrier, CarrierConfig
@@ -32,14 +33,27 @@ class JointReadout:
 
 
 def joint_names(description: RobotDescription) -> tuple[str, ...]:
-    """Return the controlled joints: of each arm its own, then the driving finger joint; at last the lift."""
-    lift = () if description.lift is None else (description.lift.joint,)
-    return (*(name for arm in description.arms.values() for name in arm.controlled), *lift)
+    """Return the controlled joints: of each arm its own, then the driving finger joint."""
+    return tuple(name for arm in description.arms.values() for name in arm.controlled)
 
 
 def arm_groups(description: RobotDescription) -> dict[str, JointGroup]:
     """Return the joint group of each arm, by name."""
     return {name: _group(description, arm.joints) for name, arm in description.arms.items()}
+
+
+def lift_group(description: RobotDescription) -> dict[str, JointGroup]:
+    """Return the joint group of the lift, by the name of its controller; none without one."""
+    return {} if description.lift is None else {LIFT: _group(description, (description.lift.joint,))}
+
+
+def lift_carriers(description: RobotDescription, config: CarrierConfig) -> dict[str, Carrier]:
+    """Return what makes servo targets for the lift, whose drive carries it; as `lift_group`."""
+    lift = description.lift
+    if lift is None:
+        return {}
+    stiffness, damping, none = (np.array([value]) for value in (lift.stiffness, lift.damping, 0.0))
+    return {LIFT: Carrier(ServoModel(stiffness, damping, none, none, none), config)}
 
 
 def gripper_groups(description: RobotDescription) -> dict[str, JointGroup]:

@@ -16,7 +16,7 @@ from openarm_common.types import Array
 from openarm_control.arm import TrajectoryConfig
 from openarm_control.controller import JointController, RobotController
 from openarm_control.gripper import GripperConfig
-from openarm_control.joints import JointReadout, arm_groups, carriers, gripper_groups
+from openarm_control.joints import JointReadout, arm_groups, carriers, gripper_groups, lift_carriers, lift_group
 from openarm_sim_bridge.faults.world_faults import WorldFaults
 from openarm_sim_bridge.world.stage import Stage
 from openarm_sim_bridge.world.world import World
@@ -81,14 +81,15 @@ class SimulatedRobot(Generic[ControllerT]):
         description, limits = stage.description, world.effort_limits()
         fingers = {arm: world.joint_names.index(description.finger_joint(arm)) for arm in description.arm_names}
         return RobotController(
-            arm_groups(description),
+            arm_groups(description) | lift_group(description),
             gripper_groups(description),
             world.joint_names,
             world.read_joints(),
             {arm: float(limits[finger]) for arm, finger in fingers.items()},
             trajectory,
             gripper or GripperConfig(),
-            carriers(description, trajectory.carrier, stage.servos if servos is None else servos),
+            carriers(description, trajectory.carrier, stage.servos if servos is None else servos)
+            | lift_carriers(description, trajectory.carrier),
         )
 
     def tick(self, steps: int | None = None) -> None:

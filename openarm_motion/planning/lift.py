@@ -7,16 +7,28 @@ kept, since a lift stands still most of the time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property, lru_cache
 
+import numpy as np
+
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_motion.planning.arm import Arm
+from openarm_common.robot.lift import LiftParts
+from openarm_motion.collision.exact import CollisionContext, CollisionScene
+from openarm_motion.collision.robot import CollisionRobot
+from openarm_motion.collision.solids import Box
+from openarm_motion.kinematics.chain import ArmKinematics
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.timing.trajectory import JointLimits, Trajectory, time_polyline
 
 #: Arms are those of a height that is no further from the measured one, m; heights are multiples of it.
 _STEP = 0.0005
 #: Heights whose arms are kept.
 _KEPT = 8
+#: Travel of the lift between two collision checks, m.
+_TRAVEL = 0.004
 
 
 class LiftedArms(Mapping[str, Arm]):
@@ -32,6 +44,7 @@ class LiftedArms(Mapping[str, Arm]):
         if lift is None:
             raise ValueError(f"robot {description.name!r} has no lift")
         self.joint = lift.joint
+        self.description, self.lift = description, lift
 
         @lru_cache(maxsize=_KEPT)
         def at(steps: int) -> Mapping[str, Arm]:
@@ -60,6 +73,11 @@ class LiftedArms(Mapping[str, Arm]):
             arm.static = self._arms[name].static
         self._height, self._arms = steps * _STEP, found
 
+    @cached_property
+    def motion(self) -> LiftMotion:
+        """Plans motions of the lift."""
+        return LiftMotion(self.description, self.lift, {name: arm.kinematics.tool_link for name, arm in self.items()})
+
     def __getitem__(self, name: str) -> Arm:
         return self._arms[name]
 
@@ -68,3 +86,73 @@ class LiftedArms(Mapping[str, Arm]):
 
     def __len__(self) -> int:
         return len(self._arms)
+
+
+class LiftMotion:
+    """Plans motions of the lift: straight, while both arms and what they hold keep their posture.
+
+    Args:
+        description: The robot.
+        lift: Its lift.
+        tools: Tool link of each arm.
+    """
+
+    def __init__(self, description: RobotDescription, lift: LiftParts, tools: Mapping[str, str]) -> None:
+        self._joint, self._lift = description.joint(lift.joint), lift
+        chains = {name: ArmKinematics(description, tool) for name, tool in tools.items()}
+        self._robots = {name: CollisionRobot(description, chain) for name, chain in chains.items()}
+
+    def plan(
+        self,
+        arms: Mapping[str, Arm],
+        now: StartState,
+        held: Mapping[str, Sequence[Box]],
+        height: float,
+        obstacles: Sequence[Box] = (),
+    ) -> Trajectory:
+        """Plan a motion to a height.
+
+        Args:
+            arms: As they are, by name.
+            now: State of all joints, and the surroundings.
+            held: What each hand holds, tool frame.
+            height: Position of the lift, m.
+            obstacles: Boxes in addition, base frame.
+
+        Raises:
+            OpenArmError: LIMITS, for a height outside the limits; IN_COLLISION, naming what would be hit and where.
+        """
+        joint = self._joint
+        if not joint.lower <= height <= joint.upper:
+            text = f"lift is asked for {height:g} m, allowed {joint.lower:g} to {joint.upper:g} m"
+            raise OpenArmError(Code.LIMITS, text)
+        start = float(np.clip(now.state[joint.name], joint.lower, joint.upper))
+        steps = max(2, int(np.ceil(abs(height - start) / _TRAVEL)) + 1)
+        for name, robot in self._robots.items():
+            scene = self._scene(arms[name], robot, now, held.get(name, ()), obstacles)
+            for position in np.linspace(start, height, steps).tolist():
+                q = np.array([position if n == joint.name else now.state[n] for n in robot.kinematics.names])
+                if scene.collides(q):
+                    contact = scene.contacts(q)[0]
+                    text = f"the lift can't go from {start:.3f} to {height:.3f} m: at {position:.3f} m {contact}"
+                    raise PlanFailedError(Code.IN_COLLISION, text, "search", contact)
+        values = (joint.velocity, self._lift.acceleration, self._lift.jerk)
+        scale = next(iter(arms.values())).scale(now.scale)
+        limits = JointLimits(*(np.array([value]) for value in values)).scaled(scale)
+        return time_polyline((joint.name,), np.array([[start], [height]]), limits)
+
+    def _scene(
+        self, arm: Arm, robot: CollisionRobot, now: StartState, held: Sequence[Box], obstacles: Sequence[Box]
+    ) -> CollisionScene:
+        certain = (*arm.static, *now.environment.solids)
+        fixed = frozenset(body.id for body in certain)
+        around = CollisionContext(
+            state=now.state,
+            boxes=[*certain, *obstacles],
+            held=held,
+            supports=fixed,
+            fixed=fixed,
+            clearance=arm.config.clearance,
+            map=now.environment.map,
+        )
+        return CollisionScene(robot, around)

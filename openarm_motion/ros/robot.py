@@ -15,6 +15,7 @@ from unique_identifier_msgs.msg import UUID
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.lifeline import Lifeline
+from openarm_common.robot.lift import LIFT
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.actions import LEASE, ActionClient, latest, owner_topic
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_to_msg
@@ -52,7 +53,7 @@ class NodeRobot:
         self.listener = RobotStateListener(node, node.description)
         self._controllers = {
             arm: Controller(node, config.controller.format(arm=arm), partial(holds.goal_id, arm))
-            for arm in config.arms or node.description.arm_names
+            for arm in (*(config.arms or node.description.arm_names), *([LIFT] if node.description.lift else []))
         }
         self._waiting, self._wake = 0, Future(executor=node.executor)
         self._timer = node.create_timer(_PERIOD, self._on_timer, clock=node.steady_clock)

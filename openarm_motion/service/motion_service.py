@@ -17,6 +17,7 @@ from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.lift import LIFT
 from openarm_common.robot.work import Table
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid, box_from
@@ -35,6 +36,7 @@ from openarm_motion.scene.planning_scene import PlanningScene
 from openarm_motion.service.context import PlanningContext
 from openarm_motion.service.coordination import ArmCoordination
 from openarm_motion.service.faults import PlanFaults
+from openarm_motion.service.lift import LiftMotions
 from openarm_motion.service.requests import (
     ApproachAnswer,
     ArmGoal,
@@ -137,6 +139,8 @@ class MotionService:
         view = MapView(config.map, field, frames)
         self._context = PlanningContext(robot, arms, self.scene, self.memory, self.coordination, view, config)
         self._claimed: set[str] = set()
+        lifted = (robot, arms, self._context, self.memory, self._claim) if isinstance(arms, LiftedArms) else None
+        self._lift = LiftMotions(*lifted) if lifted else None
 
     # --- plans and motions
     async def plan_approach(
@@ -178,7 +182,9 @@ class MotionService:
     async def move(
         self, request: MoveRequest, cancelled: Callable[[], bool] = never, report: Report = silent
     ) -> MoveAnswer:
-        """Plan, and unless it is `plan_only` execute, a motion of one arm; arguments as `plan_approach`."""
+        """Plan, and unless it is `plan_only` execute, a motion of one arm or the lift; arguments as `plan_approach`."""
+        if request.arm == LIFT and self._lift is not None:
+            return await self._lift.move(request, self._stopped(cancelled))
         answer, begin, holding = MoveAnswer(), self.robot.now(), ""
         try:
             arm, stopped = self._arm(request.arm), self._stopped(cancelled)

@@ -86,10 +86,10 @@ class PlanApproachRequest:
 
 @dataclass(frozen=True, eq=False)
 class MoveRequest:
-    """Plan, and unless `plan_only` execute, a motion of one arm.
+    """Plan, and unless `plan_only` execute, a motion of one arm, or of the lift that carries all of them.
 
     Attributes:
-        arm: Name of the arm.
+        arm: Name of the arm; `lift`: the lift, with a `JointGoal` of its position, m.
         goal: Where to.
         obstacles: Boxes, base frame.
         attached: Boxes held by the arm, tool frame; empty: what it is known to hold.

@@ -46,7 +46,8 @@ class Stage:
         self._hardware = hardware or IDEAL
         made = drawn(self._hardware, description)
         self._robot = robot_spec(description, physics, made)
-        self.joint_names = joint_names(description)
+        lift = () if description.lift is None else (description.lift.joint,)
+        self.joint_names = (*joint_names(description), *lift)
         self.encoders = made.encoders(description, self.joint_names)
         self.home: dict[str, float] = {}
         if description.lift is not None:

@@ -19,7 +19,7 @@ from openarm_motion.collision.solids import box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.lift import LiftedArms
 from openarm_motion.service.motion_service import make_arms
-from openarm_motion.service.requests import MoveRequest, PoseGoal
+from openarm_motion.service.requests import JointGoal, LineGoal, MoveRequest, PoseGoal
 
 ROBOT_NAME = "openarm_v2_cell"
 LIFT = "openarm_lifter_joint"
@@ -98,24 +98,74 @@ def test_arms_stay_those_of_a_height_that_is_near_enough_or_not_known(home, arms
     assert arms[SIDE] is first  # what was made is kept
 
 
-@pytest.mark.requirement("R-04")
-def test_the_tool_goes_to_a_pose_in_the_base_frame_at_any_height(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Planned from measured joints, carried out by the simulated robot, seen in the simulation itself."""
+def done(robot: SimRobot, work):
+    """The answer of a request, one control tick a turn."""
+    while True:
+        try:
+            work.send(None)
+        except StopIteration as end:
+            return end.value
+        robot.tick()
+
+
+def to_height(height: float, scale: float = 0.0) -> MoveRequest:
+    return MoveRequest("lift", JointGoal(np.array([height])), scale=scale)
+
+
+def at(robot: SimRobot) -> float:
+    return float(robot.world.data.joint(LIFT).qpos[0])
+
+
+@pytest.fixture
+def simulated(monkeypatch: pytest.MonkeyPatch) -> SimRobot:
+    """With its lift at 0.12 m."""
     monkeypatch.setenv(ROBOT, ROBOT_NAME)
     senses = SimulatedSenses(depth_noise=False, sets=("motion.map.use=off", "mujoco_bridge.profile=ideal"))
     robot = SimRobot(Scene(name="empty"), senses, posture={LIFT: 0.12})
     robot.pass_time(0.2)
+    return robot
+
+
+@pytest.mark.requirement("R-04")
+def test_the_tool_goes_to_a_pose_in_the_base_frame_at_any_height(simulated: SimRobot) -> None:
+    """Planned from measured joints, carried out by the simulated robot, seen in the simulation itself."""
     down = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.42, -0.25, 1.30))
-    work = robot.motion.move(MoveRequest(SIDE, PoseGoal(down)))
-    answer = None
-    while answer is None:
-        try:
-            work.send(None)
-            robot.tick()
-        except StopIteration as end:
-            answer = end.value
+    answer = done(simulated, simulated.motion.move(MoveRequest(SIDE, PoseGoal(down))))
     assert answer.error is None, answer.message
-    robot.pass_time(0.5)
-    site = robot.world.data.site(robot.description.tcp_link(SIDE))
+    simulated.pass_time(0.5)
+    site = simulated.world.data.site(simulated.description.tcp_link(SIDE))
     assert np.linalg.norm(site.xpos - down[:3, 3]) < 0.003
-    assert robot.world.data.joint(LIFT).qpos[0] == pytest.approx(0.12, abs=0.001)
+    assert at(simulated) == pytest.approx(0.12, abs=0.001)
+
+
+@pytest.mark.requirement("R-04")
+def test_the_lift_moves_with_both_arms_and_what_is_planned_next_is_of_its_new_height(simulated: SimRobot) -> None:
+    joints = [name for arm in simulated.description.arms.values() for name in arm.joints]
+    columns = simulated.columns(joints)
+    before = simulated.world.read_joints().position[columns]
+    answer = done(simulated, simulated.motion.move(to_height(0.05, scale=1.0)))
+    assert answer.error is None, answer.message
+    assert answer.trajectory is not None
+    assert np.abs(answer.trajectory.v).max() <= 0.05 + 1e-9  # m/s, of the URDF
+    assert at(simulated) == pytest.approx(0.05, abs=0.001)
+    np.testing.assert_allclose(simulated.world.read_joints().position[columns], before, atol=0.01)
+    assert isinstance(simulated.motion.arms, LiftedArms)
+    assert simulated.motion.arms.height == pytest.approx(0.05, abs=0.001)
+
+
+def test_a_lift_that_would_hit_something_does_not_move(simulated: SimRobot) -> None:
+    """At the top the fingers of the home posture are in the roof; a solid over a hand is met on the way."""
+    tool = simulated.world.data.site(simulated.description.tcp_link(SIDE)).xpos
+    bar = box_from("bar", (tool[0], tool[1], tool[2] + 0.12), (0.05, 0.05, 0.05))
+    for height, solids, words in ((0.3, (), "openarm_cell"), (0.2, (bar,), "bar"), (0.31, (), "allowed 0 to 0.3 m")):
+        simulated.motion.apply_scene(clear=True, remove=(), add=solids)
+        answer = done(simulated, simulated.motion.move(to_height(height)))
+        assert answer.error is not None
+        assert words in answer.message
+        assert at(simulated) == pytest.approx(0.12, abs=0.001)
+
+
+def test_what_is_no_height_is_refused(simulated: SimRobot) -> None:
+    for goal in (JointGoal(np.zeros(7)), JointGoal(np.array([np.nan])), LineGoal(np.eye(4))):
+        answer = done(simulated, simulated.motion.move(MoveRequest("lift", goal)))
+        assert "takes a joint goal of one position, m" in answer.message
