@@ -6,17 +6,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.lift import LIFT
-from openarm_motion.planning.lift import LiftedArms
-from openarm_motion.scene.held import HeldObjects
-from openarm_motion.service.context import PlanningContext
-from openarm_motion.service.requests import JointGoal, MoveAnswer, MoveRequest
+from openarm_common.types import Array
 from openarm_motion.service.robot import RobotInterface, TrajectoryGoal, Watch
-from openarm_motion.timing.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from openarm_motion.planning.lift import LiftedArms
+    from openarm_motion.scene.held import HeldObjects
+    from openarm_motion.service.context import PlanningContext
+    from openarm_motion.service.requests import MoveAnswer, MoveRequest
+    from openarm_motion.timing.trajectory import Trajectory
 
 #: A controller has this long beyond the duration, s.
 _OVERTIME = 5.0
@@ -45,16 +49,20 @@ class LiftMotions:
     ) -> None:
         self._robot, self._arms, self._context, self._memory, self._claim = robot, arms, context, memory, claim
 
-    async def move(self, request: MoveRequest, stopped: Callable[[], bool]) -> MoveAnswer:
+    async def move(
+        self, goal: Array, request: MoveRequest, stopped: Callable[[], bool], answer: MoveAnswer
+    ) -> MoveAnswer:
         """Plan, and unless it is `plan_only` execute, a motion of the lift.
 
         Args:
+            goal: (1,) position of the lift, m; of another size when the request asks for something else.
             request: What is asked.
             stopped: Whether to stop.
+            answer: To be filled.
         """
-        answer, begin = MoveAnswer(), self._robot.now()
+        begin = self._robot.now()
         try:
-            height = _height(request)
+            height = _height(goal)
             with self._claim(*self._arms, wanted=not request.plan_only):
                 await self._context.fresh()
                 self._arms.follow(self._robot.states.latest()[1])
@@ -100,17 +108,11 @@ class LiftMotions:
             raise OpenArmError(goal.outcome.code, f"{controller.name}: {goal.outcome.text}")
 
 
-def _height(request: MoveRequest) -> float:
-    """Return the position of the lift that a request asks for, m.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, when it asks for something else.
-    """
-    q = np.ravel(request.goal.q) if isinstance(request.goal, JointGoal) else np.zeros(0)
-    if q.size != 1 or not np.isfinite(q).all():
-        text = f"the lift takes a joint goal of one position, m; got {q.tolist() or type(request.goal).__name__}"
-        raise OpenArmError(Code.INVALID_ARGUMENT, text)
-    return float(q[0])
+def _height(goal: Array) -> float:
+    if goal.shape != (1,) or not np.isfinite(goal).all():
+        got = f"{goal.tolist()}" if goal.size else "another kind of goal"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"the lift takes a joint goal of one position, m; got {got}")
+    return float(goal[0])
 
 
 def _ended(goal: TrajectoryGoal) -> bool:

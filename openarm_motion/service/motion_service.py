@@ -183,9 +183,10 @@ class MotionService:
         self, request: MoveRequest, cancelled: Callable[[], bool] = never, report: Report = silent
     ) -> MoveAnswer:
         """Plan, and unless it is `plan_only` execute, a motion of one arm or the lift; arguments as `plan_approach`."""
-        if request.arm == LIFT and self._lift is not None:
-            return await self._lift.move(request, self._stopped(cancelled))
         answer, begin, holding = MoveAnswer(), self.robot.now(), ""
+        if request.arm == LIFT and self._lift is not None:
+            goal = np.ravel(request.goal.q) if isinstance(request.goal, JointGoal) else np.zeros(0)
+            return await self._lift.move(goal, request, self._stopped(cancelled), answer)
         try:
             arm, stopped = self._arm(request.arm), self._stopped(cancelled)
             with self._claim(arm.name, wanted=not request.plan_only):

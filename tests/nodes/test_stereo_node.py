@@ -45,7 +45,8 @@ class Bench:
         self.left, self.right = load_cameras()["head_left"], load_cameras()["head_right"]
         self.depth_of_wall = self.left.intrinsics.fx * self.right.baseline / SHIFT
         rng = np.random.default_rng(1)
-        wall = cv2.resize(rng.integers(0, 255, (160, 240), dtype=np.uint8), (720, 480), interpolation=cv2.INTER_CUBIC)
+        size = (self.left.width + SHIFT, self.left.height)
+        wall = cv2.resize(rng.integers(0, 255, (160, 300), dtype=np.uint8), size, interpolation=cv2.INTER_CUBIC)
         self.images = {c.name: np.repeat(w[..., None], 3, axis=2) for c, w in self._views(wall)}
         make = ros.node.create_publisher
         self.publishers = {
@@ -63,7 +64,7 @@ class Bench:
         ros.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
 
     def _views(self, wall):
-        return (self.left, wall[:, :640]), (self.right, np.ascontiguousarray(wall[:, SHIFT : SHIFT + 640]))
+        return (self.left, wall[:, :-SHIFT]), (self.right, wall[:, SHIFT:])
 
     def _hear(self, message) -> None:
         self.reports += [s.message for s in message.status if s.name.startswith("stereo_depth")]
@@ -108,7 +109,8 @@ def test_depth_of_a_pair_is_what_the_cloud_node_takes(ros) -> None:
     assert (depths[0].encoding, depths[0].header.frame_id) == ("16UC1", bench.left.optical_frame)
     assert stamp_to_ns(depths[0].header.stamp) % 250_000_000 == 0
     k = intrinsics_from_info(infos[0])
-    assert (k.width, k.height, k.fx, k.cx) == pytest.approx((640, 480, bench.left.intrinsics.fx, 319.5))
+    own = bench.left.intrinsics
+    assert (k.width, k.height, k.fx, k.cx) == pytest.approx((own.width, own.height, own.fx, own.cx))
     assert np.median(depth[:, SHIFT + 10 :]) == pytest.approx(1e3 * bench.depth_of_wall, abs=6.0)
     assert np.count_nonzero(depth[:, SHIFT + 10 :]) > 0.95 * depth[:, SHIFT + 10 :].size
     assert np.count_nonzero(depth[:, : SHIFT - 5]) < 0.2 * depth[:, : SHIFT - 5].size
