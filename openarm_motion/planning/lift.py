@@ -73,6 +73,21 @@ class LiftedArms(Mapping[str, Arm]):
             arm.static = self._arms[name].static
         self._height, self._arms = steps * _STEP, found
 
+    def update(self, arms: Mapping[str, Arm]) -> None:
+        """Be the arms of another description of the same robot, at the height that they are at.
+
+        Raises:
+            ValueError: For arms that are on no lift.
+        """
+        if not isinstance(arms, LiftedArms):
+            raise ValueError("expected arms on a lift")
+        self._at, self.description = arms._at, arms.description
+        found = self._at(round(self._height / _STEP))
+        for name, arm in found.items():
+            arm.static = self._arms[name].static
+        self._arms = found
+        self.__dict__.pop("motion", None)
+
     @cached_property
     def motion(self) -> LiftMotion:
         """Plans motions of the lift."""

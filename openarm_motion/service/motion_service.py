@@ -125,7 +125,7 @@ class MotionService:
         frames: Sequence[str],
     ) -> None:
         self.robot, self.config, self._frames = robot, config, tuple(frames)
-        self.arms = arms = dict(arms)
+        self.arms = arms = arms if isinstance(arms, LiftedArms) else dict(arms)
         self.faults = PlanFaults(config.faults)
         #: No new motion is begun, and those under way hold.
         self.closing = False
