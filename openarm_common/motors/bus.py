@@ -42,11 +42,7 @@ def pack(frame: Frame, *, flexible: bool) -> bytes:
         flexible: As a frame of CAN FD with the faster data rate.
     """
     number, data = frame
-    return (
-        _FLEXIBLE.pack(number, len(data), _RATE_SWITCH, data)
-        if flexible
-        else _CLASSIC.pack(number, len(data), data)
-    )
+    return _FLEXIBLE.pack(number, len(data), _RATE_SWITCH, data) if flexible else _CLASSIC.pack(number, len(data), data)
 
 
 def unpack(raw: bytes | memoryview) -> Frame | None:
