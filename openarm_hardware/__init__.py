@@ -14,6 +14,7 @@ from openarm_common.lazy import attach
 if TYPE_CHECKING:
     from openarm_hardware.arm import ArmMachine as ArmMachine
     from openarm_hardware.client import ServoProcess as ServoProcess
+    from openarm_hardware.driver import MotorDriver as MotorDriver
     from openarm_hardware.exchange import Command as Command
     from openarm_hardware.machine import Machine as Machine
     from openarm_hardware.settings import Settings as Settings

@@ -172,8 +172,9 @@ class ArmMachine:
         if self.phase is Phase.DAMPED:
             return
         for motor in self.motors:
-            switching = self.phase is Phase.ENABLING and motor.status == Status.DISABLED
-            if (why := motor.fault) and not (switching and motor.missed == 0):
+            if self.phase is Phase.ENABLING and motor.status == Status.DISABLED and not motor.gone:
+                continue
+            if why := motor.fault:
                 self.fail(why, now_ns)
                 return
         for motor in self.motors:
@@ -199,7 +200,7 @@ class ArmMachine:
         self._become(Phase.SETTING, "", now_ns)
 
     def _set(self, now_ns: int, command: Sequence[tuple[float, float]] | None) -> None:
-        if silent := [motor for motor in self.motors if motor.missed >= self._settings.silent]:
+        if silent := [motor for motor in self.motors if motor.gone]:
             self._become(Phase.LOOKING, f"no reply of {_named(silent)}", now_ns)
         elif unset := [motor for motor in self.motors if not motor.configured]:
             self.text = f"setting mode and timeout of {_named(unset)}"

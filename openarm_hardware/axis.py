@@ -86,9 +86,14 @@ class MotorAxis:
         return self.status >= 0 and self.missed == 0
 
     @property
+    def gone(self) -> bool:
+        """Whether too many replies are missing."""
+        return self.missed >= self._settings.silent
+
+    @property
     def fault(self) -> str:
         """Why its state says that it can't be commanded; of a motor that should be on."""
-        if self.missed >= self._settings.silent:
+        if self.gone:
             return f"{self.axis} has left out {self.missed} replies"
         if self.status not in (Status.ENABLED, -1):
             return f"{self.axis} reports: {frames.status_text(self.status)}"

@@ -7,25 +7,20 @@ process `python -m openarm_hardware.emulator` is told what to do by lines of JSO
 
 from __future__ import annotations
 
-import heapq
 import json
 import math
 import os
-import select
-import socket
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from openarm_common.errors import OpenArmError
 from openarm_common.motors.axis import Axis
-from openarm_common.motors.bus import Frame, SocketBus
 from openarm_common.motors.emulated import EmulatedBuses, EmulatedMotor
 from openarm_common.motors.frames import MitCommand
+from openarm_common.motors.server import BusServer
 from openarm_hardware.servo import schedule
 
 #: Inertia (kg m2) and weight (N m, times the sine of the position) by largest torque of a motor.
@@ -70,75 +65,16 @@ class LooseJoints:
         motor.q += h * motor.dq
 
 
-class BusServer:
-    """Serves emulated buses on local sockets.
-
-    Args:
-        buses: Their addresses are `unix:PATH`.
-        advance: Moves what the motors move until a time, ns.
-        flexible: Whether replies are CAN FD.
-    """
+class WatchedServer(BusServer):
+    """Notes when joints are told to hold or to damp; arguments as `BusServer`."""
 
     def __init__(self, buses: EmulatedBuses, advance: Callable[[int], None], *, flexible: bool = True) -> None:
-        self.buses, self._advance, self._flexible = buses, advance, flexible
-        self._listeners = dict[int, tuple[socket.socket, str]]()
-        self._clients = dict[int, tuple[SocketBus, str]]()
-        self._late: list[tuple[int, int, SocketBus, list[Frame]]] = []
-        self._count = 0
+        super().__init__(buses, advance, flexible=flexible)
         #: Time at which each motor was first told to hold or to damp since it was last emptied.
         self.held = dict[str, int]()
         self._before = dict[str, float]()
-        for address in buses.addresses:
-            path = Path(address.removeprefix("unix:"))
-            path.unlink(missing_ok=True)
-            listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            listener.bind(str(path))
-            listener.listen()
-            self._listeners[listener.fileno()] = listener, address
 
-    def serve(self, seconds: float, also: Sequence[int] = ()) -> list[int]:
-        """Serve what comes within a time; return the descriptors of `also` that are ready."""
-        if self._late:
-            seconds = min(seconds, max(0.0, (self._late[0][0] - time.monotonic_ns()) * 1e-9))
-        ready, _, _ = select.select([*self._listeners, *self._clients, *also], [], [], seconds)
-        now_ns = time.monotonic_ns()
-        self._advance(now_ns)
-        for fd in ready:
-            if fd in self._listeners:
-                listener, address = self._listeners[fd]
-                client = SocketBus(listener.accept()[0], address, flexible=self._flexible)
-                self._clients[client.fileno()] = client, address
-            elif fd in self._clients:
-                self._answer(fd, now_ns)
-        while self._late and self._late[0][0] <= now_ns:
-            _, _, client, replies = heapq.heappop(self._late)
-            with suppress(OSError, ValueError):
-                client.send(replies)
-        return [fd for fd in ready if fd in also]
-
-    def close(self) -> None:
-        """Close all sockets."""
-        for client, _ in self._clients.values():
-            client.close()
-        for listener, address in self._listeners.values():
-            listener.close()
-            Path(address.removeprefix("unix:")).unlink(missing_ok=True)
-
-    def _answer(self, fd: int, now_ns: int) -> None:
-        client, address = self._clients[fd]
-        try:
-            replies = self.buses.take(address, client.receive(), now_ns)
-            self._watch(now_ns)
-            if self.buses.late_s:
-                self._count += 1
-                heapq.heappush(self._late, (now_ns + round(self.buses.late_s * 1e9), self._count, client, replies))
-            else:
-                client.send(replies)
-        except OSError:
-            client.close()
-            del self._clients[fd]
-
-    def _watch(self, now_ns: int) -> None:
+    def _taken(self, now_ns: int) -> None:
         for motor in self.buses.motors:
             command, joint = motor.command, motor.axis.joint
             if isinstance(command, MitCommand):
@@ -159,7 +95,7 @@ def request(axes: Sequence[Axis], start: Mapping[str, float], **options: Any) ->
     return json.dumps({"axes": [asdict(axis) for axis in axes], "start": dict(start), **options}) + "\n"
 
 
-def _take(server: BusServer, line: str) -> dict[str, Any]:
+def _take(server: WatchedServer, line: str) -> dict[str, Any]:
     """Do what a line says; return the answer."""
     asked: dict[str, Any] = json.loads(line)
     if "fault" in asked:
@@ -183,7 +119,7 @@ def main() -> int:
     axes = [Axis(**axis) for axis in asked["axes"]]
     motors = [EmulatedMotor(axis, asked["start"].get(axis.joint, 0.0) * axis.ratio + axis.offset) for axis in axes]
     buses = EmulatedBuses(motors, asked.get("seed", 0))
-    server = BusServer(buses, LooseJoints(motors, asked.get("weight", 1.0)).advance)
+    server = WatchedServer(buses, LooseJoints(motors, asked.get("weight", 1.0)).advance)
     schedule(asked.get("priority", 0))
     os.write(1, b"{}\n")
     rest = b""

@@ -126,7 +126,9 @@ class Controllers:
 
     async def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Release the emergency stop."""
-        stopped, self._loop.stopped = self._loop.stopped, False
-        response.success, response.message = True, "the emergency stop is released" if stopped else "it was not latched"
+        stopped = self._loop.stopped
+        kept: str = await self._node.awaitable(self._loop.call(self._loop.release))
+        done = "the emergency stop is released" if stopped else "it was not latched"
+        response.success, response.message = not kept, kept or done
         self._node.get_logger().warning(response.message)
         return response

@@ -89,6 +89,10 @@ class PositionDriver:
         self._passed_on.publish(message)
         return readout
 
+    def fault(self) -> str:
+        """See `Driver.fault`: what such a driver takes or not, it does not say."""
+        return ""
+
     def targets(self, since_ns: int) -> Array:
         """See `Driver.targets`: what the driver's controllers say that they command."""
         for at, polled in self._references:

@@ -184,7 +184,21 @@ class World:
         limits = np.minimum(limits, c.effort_limit)
         self.model.actuator_forcerange[c.actuator] = np.stack([-limits, limits], axis=1)
 
+    def set_laws(self, bias: Array, stiffness: Array, damping: Array) -> None:
+        """Let the actuators pull with bias - stiffness q - damping dq (n,), q as encoders see it; not to targets."""
+        at, model = self._compiled.actuator, self.model
+        bias = bias - stiffness * self._encoders.zero
+        model.actuator_gainprm[at, 0] = 0.0
+        model.actuator_biastype[at] = mujoco.mjtBias.mjBIAS_AFFINE
+        model.actuator_biasprm[at, :3] = np.stack([bias, -stiffness, -damping], axis=1)
+
     # --- readings
+    def true_joints(self) -> JointReadout:
+        """Return positions with the errors of the joint zeros, and all else exactly: what encoders of motors see."""
+        c, d = self._compiled, self.data
+        position = d.qpos[c.qpos] + self._encoders.zero
+        return JointReadout(self.t_ns, position, d.qvel[c.dof].copy(), d.actuator_force[c.actuator].copy())
+
     def read_joints(self) -> JointReadout:
         """Return the positions, velocities and actuator efforts of the actuated joints, as their encoders have them."""
         c, d, e = self._compiled, self.data, self._encoders

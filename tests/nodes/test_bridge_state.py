@@ -32,7 +32,7 @@ from openarm_common.ros.convert import (
     xyz,
 )
 from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
-from openarm_sim_bridge.ros.state_publisher import JOINT_STATE_DEADLINE
+from openarm_control.ros.robot_publisher import JOINT_STATE_DEADLINE
 
 
 @pytest.mark.requirement("A-04", "A-15", "A-16", "A-17")

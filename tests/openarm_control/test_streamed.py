@@ -35,12 +35,16 @@ class Robot:
         self.known_ns = 2 * 10**18
         self.stop_at = 0.0
         self.silent = False
+        self.refuses = ""
 
     def now_ns(self) -> int:
         return self.t_ns
 
     def take(self) -> JointReadout | None:
         return None if self.silent else JointReadout(self.t_ns, self.at.copy(), np.zeros(2), np.zeros(2))
+
+    def fault(self) -> str:
+        return self.refuses
 
     def targets(self, since_ns: int) -> Array:
         known = self.at if self.known is None else self.known
@@ -210,6 +214,22 @@ def test_a_hand_is_closed_on_something_when_its_fingers_stop_before_the_end(benc
     assert [(end.end, end.stalled, end.reached_goal) for end in ends] == [(End.SUCCEEDED, width > 0.0, width == 0.0)]
     assert ends[0].position == pytest.approx(width)
     assert bench.controller.grippers["right"].pressing == (width > 0.0)
+
+
+def test_a_robot_that_takes_no_commands_says_why_and_begins_where_it_is_then(bench: Bench) -> None:
+    bench.ticks(2)
+    bench.go(0.9, seconds=2.0)
+    bench.ticks(50)
+    bench.robot.refuses = "the arm one_3 sinks"
+    before = len(bench.robot.commands)
+    bench.ticks(20)
+    assert bench.ends[0].text == "the arm one_3 sinks"
+    assert len(bench.robot.commands) == before
+    with pytest.raises(OpenArmError, match="one_3 sinks"):
+        bench.loop.check_able()
+    bench.robot.refuses, bench.robot.at = "", np.array([-0.2, 0.02])
+    bench.ticks(20)
+    assert bench.robot.commands[-1][0] == pytest.approx(-0.2, abs=0.01)
 
 
 def test_the_emergency_stop_holds_the_command(bench: Bench) -> None:

@@ -249,8 +249,9 @@ def test_what_is_wrong_at_the_start_is_refused() -> None:
 
 @pytest.mark.requirement("R-09")
 def test_lost_and_late_replies_are_no_false_alarm() -> None:
-    bench = Bench(silent=5).up()
+    bench = Bench(silent=5)
     bench.buses.inject("loss", value=0.05)
+    bench.up()
     bench.run(4.0)
     assert bench.phases == UP
     assert sum(state.lost for state in bench.machine.motors()) > 100

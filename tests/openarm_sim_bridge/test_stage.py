@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.edges import MovingEdges
 from openarm_common.scene.scene import Scene, SceneObject, load_scene
 from openarm_control.arm import TrajectoryConfig, TrajectoryOutcome
 from openarm_control.carrier import CarrierConfig
@@ -21,7 +22,6 @@ from openarm_control.gripper import GripperGoal, GripperOutcome
 from openarm_control.trajectory import Trajectory, TrajectoryResult
 from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.robot import SimulatedRobot
-from openarm_sim_bridge.world.edges import MovingEdges
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage, with_object
 
