@@ -16,7 +16,7 @@ from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig
 from openarm_sim_bridge.world.model import PhysicsConfig
 
 Profile = Literal["ideal", "openarm"]
-FaceName = Literal["suite", "openarm_ros2"]
+FaceName = Literal["suite", "openarm_ros2", "motors"]
 
 
 class BridgeConfig(Config):
@@ -33,8 +33,12 @@ class BridgeConfig(Config):
     )
     controllers: FaceName = Field(
         default="suite",
-        description="suite: those of this suite; openarm_ros2: as owners run them, which take positions alone;"
-        " then there are no sensors and no /clock, and stamps are of the wall clock",
+        description="suite: those of this suite; openarm_ros2: as owners run them, which take positions alone; motors:"
+        " none, motors behind local sockets take frames of their buses. But for suite there are no sensors and no"
+        " /clock, and stamps are of the wall clock",
+    )
+    motor_sockets: str = Field(
+        default="", description="folder of the motors' sockets, one of each arm; needed where controllers are motors"
     )
     calibrations: str = Field(
         default="", description="folder of calibrations, which holds identified servos; empty: the default one"

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motors of the simulated robot behind the frames of their buses: what `openarm_hardware` commands as if it were real.
+"""The motors of the simulated robot behind the frames of their buses, as `openarm_hardware` commands a real one.
 
-A command is a law of the motor's torque, which MuJoCo evaluates in each physics step; gains of the profile do not count.
+A command is a law of the motor's torque, which MuJoCo evaluates in each physics step; gains of the profile don't count.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +29,20 @@ class EmulatedRobot(JointController):
         description: The robot.
         world: Whose actuators they are.
         folder: Of the sockets; each has the name of its arm. Made where it is missing.
+        clock: Of the motors' timeouts, ns.
 
     Attributes:
         buses: The motors, with their faults.
     """
 
-    def __init__(self, description: RobotDescription, world: World, folder: Path) -> None:
+    def __init__(
+        self,
+        description: RobotDescription,
+        world: World,
+        folder: Path,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._clock = clock
         folder.mkdir(parents=True, exist_ok=True)
         addresses: Mapping[str, str] = {name: f"unix:{folder / name}" for name in description.arm_names}
         wiring = load_wiring()
@@ -52,7 +60,7 @@ class EmulatedRobot(JointController):
         """See `JointController.update`; the targets do not count."""
         self._read(self._world.true_joints())
         self._server.serve(0.0)
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock()
         for motor in self._motors:
             motor.expire(now_ns)
         bias, stiffness, damping, limits = np.array([motor.law() for motor in self._motors]).T

@@ -136,6 +136,14 @@ class JointLate(OfSide):
     ms: float = Field(default=100.0, ge=0.0, le=2_000.0, description="how late")
 
 
+class MotorFault(Config):
+    """A motor behind frames of its bus does not do as it should; see `openarm_common.motors.emulated.FAULTS`."""
+
+    kind: str = Field(min_length=1, description="silent, error, hot, freeze, zero, loss, late, bus_off or power")
+    joint: str = Field(default="", description="of the motor, where it is one")
+    value: float = Field(default=0.0, description="status nibble, °C, rad, share or s")
+
+
 def _by_name(*models: type[Config]) -> Mapping[str, type[Config]]:
     return {re.sub(r"(?<!^)(?=[A-Z])", "_", model.__name__).lower(): model for model in models}
 
@@ -143,7 +151,9 @@ def _by_name(*models: type[Config]) -> Mapping[str, type[Config]]:
 CAMERA_FAULTS = _by_name(
     CameraDrop, CameraDelay, CameraFreeze, StampOffset, IntrinsicsBias, MountKnocked, DepthPatch, LightChanged
 )
-WORLD_FAULTS = _by_name(JointStateGap, ObjectNudged, FrictionLowered, GripperStuck, GripperWeak, JointSag, JointLate)
+WORLD_FAULTS = _by_name(
+    JointStateGap, ObjectNudged, FrictionLowered, GripperStuck, GripperWeak, JointSag, JointLate, MotorFault
+)
 #: Parameters of every fault by its name.
 FAULTS: Mapping[str, type[Config]] = {**CAMERA_FAULTS, **WORLD_FAULTS}
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.motors.emulated import EmulatedBuses
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_sim_bridge.faults.faults import (
@@ -23,6 +24,7 @@ from openarm_sim_bridge.faults.faults import (
     JointLate,
     JointSag,
     JointStateGap,
+    MotorFault,
     ObjectNudged,
     OfSide,
     ParametersT,
@@ -51,6 +53,8 @@ class WorldFaults:
         self._gravcomp: Array = np.zeros(0)
         self._changed = False
         self._stuck: dict[int, float] = {}
+        #: Where frames of buses command the robot.
+        self.motors: EmulatedBuses | None = None
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -71,13 +75,23 @@ class WorldFaults:
         if isinstance(fault.parameters, ObjectNudged):
             nudge(world, fault.parameters, fault.seed)
             return
+        if isinstance(fault.parameters, MotorFault):
+            if self.motors is None:
+                text = "no motor takes frames here; that needs mujoco_bridge.controllers: motors"
+                raise OpenArmError(Code.INVALID_ARGUMENT, text)
+            self.motors.inject(fault.parameters.kind, fault.parameters.joint, fault.parameters.value)
         self._faults[fault.name] = fault
         self._renew()
 
     def clear(self, name: str = "") -> None:
         """End one fault, or all."""
+        if self.motors is not None and any(name in ("", key) for key in self._motor_faults()):
+            self.motors.inject("clear")
         self._faults = {key: fault for key, fault in self._faults.items() if name not in ("", key)}
         self._renew()
+
+    def _motor_faults(self) -> list[str]:
+        return [key for key, fault in self._faults.items() if isinstance(fault.parameters, MotorFault)]
 
     def _renew(self) -> None:
         self._changed = True

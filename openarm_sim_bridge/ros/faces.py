@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controllers with which the simulated robot is met: those of this suite, or those of openarm_ros2."""
+"""How the simulated robot is met: by controllers of this suite, by those of openarm_ros2, or by its motors."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import BaseNode
 from openarm_control.controller import JointController
 from openarm_control.joints import JointReadout
 from openarm_control.ros.controllers import Controllers
 from openarm_control.servos import KnownServos
 from openarm_sim_bridge.config import BridgeConfig
+from openarm_sim_bridge.motors import EmulatedRobot
 from openarm_sim_bridge.openarm_ros2 import OpenArmRos2, activate
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.ros.openarm_ros2_server import PositionControllerServer
@@ -32,6 +35,8 @@ class Face(ABC):
 
     controller: JointController
     wall_stamps = False
+    #: Joint states and frames are published.
+    speaks = True
 
     @abstractmethod
     def serve(self, simulation: Simulation) -> None:
@@ -128,3 +133,44 @@ class OpenArmRos2Face(Face):
         """See `Face.close`."""
         for server in self._servers:
             server.destroy()
+
+
+class MotorFace(Face):
+    """No controllers: motors take frames from local sockets, and arms hang until somebody commands them.
+
+    Args:
+        node: Owner.
+        config: Parameters.
+        stage: Of the world.
+        world: The world.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when no folder of sockets is given, or the robot's motors are not known.
+    """
+
+    wall_stamps = True
+    speaks = False
+
+    def __init__(self, node: BaseNode[Any], config: BridgeConfig, stage: Stage, world: World) -> None:
+        if not config.motor_sockets:
+            text = "controllers are motors, and motor_sockets is empty; expected a folder for their sockets"
+            raise OpenArmError(Code.CONFIG_INVALID, text)
+        world.reset(stage.posture("zero"))  # arms without power hang
+        self.controller = self._robot = EmulatedRobot(node.description, world, Path(config.motor_sockets))
+
+    def serve(self, simulation: Simulation) -> None:
+        """See `Face.serve`."""
+        simulation.faults.motors = self._robot.buses
+
+    def publish(self, state: JointReadout, world: World) -> JointReadout:
+        """See `Face.publish`."""
+        return state
+
+    def values(self) -> Mapping[str, object]:
+        """See `Face.values`."""
+        on = sum(motor.on for motor in self._robot.buses.motors)
+        return {"motors_on": on, "motor_commands": sum(motor.commands for motor in self._robot.buses.motors)}
+
+    def close(self) -> None:
+        """See `Face.close`."""
+        self._robot.close()

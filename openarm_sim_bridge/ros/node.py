@@ -29,13 +29,13 @@ from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.ros.camera_publisher import topic_names
-from openarm_sim_bridge.ros.faces import Face, OpenArmRos2Face, SuiteFace
+from openarm_sim_bridge.ros.faces import Face, MotorFace, OpenArmRos2Face, SuiteFace
 from openarm_sim_bridge.ros.fault_server import FaultServer
 from openarm_sim_bridge.ros.simulation_server import SimulationServer
 from openarm_sim_bridge.ros.state_publisher import StatePublisher, until_shutdown
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.world.stage import Stage
-from openarm_sim_bridge.world.world import Snapshot
+from openarm_sim_bridge.world.world import Snapshot, World
 
 WATCH_PERIOD_S = 0.2
 #: The simulation begins after this long at the latest, images or not, s.
@@ -65,9 +65,8 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         scene = load_scene(config.scene, config.seed)
         mount_seed = config.mount_seed if config.mount_seed >= 0 else None
         self._stage = stage = Stage(self.description, cameras, mount_seed, config.physics, config.hardware)
-        upstream = config.controllers == "openarm_ros2"
-        world = stage.world(scene, each_step=upstream)
-        self._face: Face = OpenArmRos2Face(self, stage, world) if upstream else SuiteFace(self, config, stage, world)
+        world = stage.world(scene, each_step=config.controllers != "suite")
+        self._face = self._made_face(world)
         self._simulation = Simulation(
             SimulatedRobot(self.description, world, self._face.controller),
             self._observe,
@@ -84,6 +83,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
             config.tf_rate,
             config.ground_truth_rate,
             clock=not self._face.wall_stamps,
+            robot=self._face.speaks,
         )
         self._images = self._camera_feed(cameras, world.snapshot()) if config.images else None
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
@@ -113,6 +113,13 @@ class MujocoBridge(ControlNode[BridgeConfig]):
             self._images.close()
         self._face.close()
         super().close()
+
+    def _made_face(self, world: World) -> Face:
+        if self.config.controllers == "openarm_ros2":
+            return OpenArmRos2Face(self, self._stage, world)
+        if self.config.controllers == "motors":
+            return MotorFace(self, self.config, self._stage, world)
+        return SuiteFace(self, self.config, self._stage, world)
 
     def _observe(self, state: JointReadout) -> None:
         """End of a tick, in the thread of the simulation."""

@@ -83,7 +83,6 @@ def feedback_table() -> list[tuple[str, Feedback, bytes]]:
     return rows
 
 
-@pytest.mark.requirement("R-08")
 def test_commands_and_replies_are_those_of_a_table_that_is_computed_in_another_way() -> None:
     commands, replies = mit_table(), feedback_table()
     assert len(commands) >= 200
@@ -143,7 +142,6 @@ def test_registers_come_back(motor: int, register: int, value: int, written: boo
     assert frames.decode_register_request(request) == (motor, "write", register, value)
 
 
-@pytest.mark.requirement("R-08")
 @pytest.mark.parametrize("value", [math.nan])
 def test_what_is_no_number_is_refused(value: float) -> None:
     kind = frames.motor_type("DM4310")
@@ -168,7 +166,6 @@ def test_frames_pass_the_socket_format(number: int, data: bytes, flexible: bool)
     assert not is_error(raw)
 
 
-@pytest.mark.requirement("R-08")
 @given(st.one_of(st.binary(max_size=80), st.binary(min_size=16, max_size=16), st.binary(min_size=72, max_size=72)))
 def test_any_bytes_are_a_frame_or_nothing(raw: bytes) -> None:
     frame = unpack(raw)

@@ -45,7 +45,6 @@ def test_states_and_commands_are_read_as_they_were_written(both: tuple[Exchange,
     assert writer.read_command() == command
 
 
-@pytest.mark.requirement("R-09")
 def test_what_is_half_written_is_not_read(both: tuple[Exchange, Exchange]) -> None:
     writer, reader = both
     writer.write_command(Command(5, ((0.1, 1.0),) * 3))
@@ -76,7 +75,6 @@ def test_a_bus_carries_frames_in_order(frames: list[tuple[int, bytes]], flexible
     other.close()
 
 
-@pytest.mark.requirement("R-08")
 @given(st.lists(st.binary(max_size=100), max_size=20))
 def test_a_bus_leaves_out_what_is_no_frame(messages: list[bytes]) -> None:
     a, b = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

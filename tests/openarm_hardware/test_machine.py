@@ -18,7 +18,6 @@ UP = [Phase.FOLLOWING, Phase.FOLLOWING]
 HALF = [Phase.DAMPED, Phase.HELD]
 
 
-@pytest.mark.requirement("R-09")
 def test_without_a_client_nothing_is_switched_on_and_nothing_is_commanded() -> None:
     bench = Bench()
     bench.client = None
@@ -30,7 +29,6 @@ def test_without_a_client_nothing_is_switched_on_and_nothing_is_commanded() -> N
     assert {motor.registers[10] for motor in bench.motors if motor.axis.grips} == {4}
 
 
-@pytest.mark.requirement("R-09")
 @settings(max_examples=6, deadline=None)
 @given(st.floats(-1.9, 1.9), st.floats(0.0, 1.0))
 def test_arms_come_up_where_they_are(start: float, weight: float) -> None:
@@ -53,7 +51,6 @@ def test_arms_come_up_where_they_are(start: float, weight: float) -> None:
     assert max(abs(motor.dq) for motor in bench.motors if not motor.axis.grips) < 0.4
 
 
-@pytest.mark.requirement("R-08")
 def test_commands_are_joined_by_lines_and_followed() -> None:
     bench = Bench().up()
     start, since = bench.q(), bench.now_ns
@@ -76,7 +73,6 @@ def test_commands_are_joined_by_lines_and_followed() -> None:
         assert q == pytest.approx(target, abs=0.002 if axis.grips else 0.03)
 
 
-@pytest.mark.requirement("R-09")
 def test_a_silent_motor_stops_its_arm_softly_and_the_other_one_holds() -> None:
     bench = Bench(weight=1.0, silent=3)
     bench.client = bench.carried
@@ -109,7 +105,6 @@ FAULTS = [
 ]
 
 
-@pytest.mark.requirement("R-09")
 @pytest.mark.parametrize(("fault", "joint", "value", "phases", "text"), FAULTS)
 def test_a_fault_is_named_latched_and_reset_when_it_is_gone(fault, joint, value, phases, text) -> None:
     bench = Bench().up()
@@ -134,7 +129,6 @@ def test_a_fault_is_named_latched_and_reset_when_it_is_gone(fault, joint, value,
     assert all(motor.registers[9] == 4000 for motor in bench.motors)
 
 
-@pytest.mark.requirement("R-09")
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, 0.8, -0.8])
 def test_a_command_that_jumps_is_not_followed(wrong: float) -> None:
     bench = Bench().up()
@@ -152,7 +146,6 @@ def test_a_command_that_jumps_is_not_followed(wrong: float) -> None:
     assert bench.phases == UP
 
 
-@pytest.mark.requirement("R-09")
 def test_commands_beyond_the_limits_end_at_them() -> None:
     bench = Bench(start=1.9).up()
     since = bench.now_ns
@@ -163,7 +156,6 @@ def test_commands_beyond_the_limits_end_at_them() -> None:
     assert max(q for q, a in zip(bench.q(), bench.axes, strict=True) if not a.grips) < 2.25
 
 
-@pytest.mark.requirement("R-09")
 def test_a_frozen_encoder_is_found_when_the_arm_moves() -> None:
     bench = Bench().up()
     bench.buses.inject("freeze", "one_4")
@@ -177,7 +169,6 @@ def test_a_frozen_encoder_is_found_when_the_arm_moves() -> None:
     assert "off its command" in bench.machine.text
 
 
-@pytest.mark.requirement("R-09")
 def test_without_fresh_commands_the_arms_hold_and_go_on_with_the_next() -> None:
     bench = Bench().up()
     good, bench.client = bench.client, None
@@ -191,7 +182,7 @@ def test_without_fresh_commands_the_arms_hold_and_go_on_with_the_next() -> None:
     assert bench.machine.text == ""
 
 
-@pytest.mark.requirement("R-09", "B-55")
+@pytest.mark.requirement("B-55")
 def test_the_emergency_stop_holds_at_once_with_the_weight_carried() -> None:
     bench = Bench(weight=1.0)
     bench.client = bench.carried
@@ -216,7 +207,6 @@ def test_the_emergency_stop_holds_at_once_with_the_weight_carried() -> None:
     assert bench.phases == UP
 
 
-@pytest.mark.requirement("R-09")
 def test_a_zero_that_jumped_is_refused_by_name_until_somebody_has_looked() -> None:
     last = {"one_2": 1.2, "two_2": 0.3}
     bench = Bench(last=last)
@@ -229,7 +219,6 @@ def test_a_zero_that_jumped_is_refused_by_name_until_somebody_has_looked() -> No
     bench.up()
 
 
-@pytest.mark.requirement("R-09")
 def test_what_is_wrong_at_the_start_is_refused() -> None:
     bench = Bench(start=2.5)
     bench.run(0.3)
@@ -247,7 +236,6 @@ def test_what_is_wrong_at_the_start_is_refused() -> None:
     assert "under voltage" in bench.machine.text
 
 
-@pytest.mark.requirement("R-09")
 def test_lost_and_late_replies_are_no_false_alarm() -> None:
     bench = Bench(silent=5)
     bench.buses.inject("loss", value=0.05)
@@ -257,7 +245,6 @@ def test_lost_and_late_replies_are_no_false_alarm() -> None:
     assert sum(state.lost for state in bench.machine.motors()) > 100
 
 
-@pytest.mark.requirement("R-09")
 def test_the_end_lets_arms_sink_and_switches_them_off() -> None:
     bench = Bench(weight=1.0)
     bench.client = bench.carried
@@ -272,7 +259,6 @@ def test_the_end_lets_arms_sink_and_switches_them_off() -> None:
     assert not any(motor.on for motor in bench.motors)
 
 
-@pytest.mark.requirement("R-08", "R-09")
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 2**32))
 def test_frames_that_are_none_of_the_motors_change_nothing(seed: int) -> None:
@@ -294,7 +280,6 @@ def test_frames_that_are_none_of_the_motors_change_nothing(seed: int) -> None:
         assert noisy.sent == clean.sent
 
 
-@pytest.mark.requirement("R-08", "R-09")
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 2**32))
 def test_no_bytes_from_the_bus_make_a_command(seed: int) -> None:
@@ -310,7 +295,6 @@ def test_no_bytes_from_the_bus_make_a_command(seed: int) -> None:
     bench.run(0.5)
 
 
-@pytest.mark.requirement("R-09")
 def test_an_arm_never_moves_by_itself_whatever_happens_to_it() -> None:
     """200 random faults while it is still, most of them reset: joints without weight stay where they are."""
     rng = random.Random(5)

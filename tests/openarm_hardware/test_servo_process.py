@@ -107,7 +107,6 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     found.close()
 
 
-@pytest.mark.requirement("R-08", "R-09")
 def test_a_servo_has_one_thread_holds_stops_and_ends_with_motors_that_are_off(rig: Rig) -> None:
     servo = rig.up()
     assert len(os.listdir(f"/proc/{servo.pid}/task")) == 1
@@ -126,7 +125,6 @@ def test_a_servo_has_one_thread_holds_stops_and_ends_with_motors_that_are_off(ri
     assert not any(rig.ask()[axis.joint]["on"] for axis in rig.axes)
 
 
-@pytest.mark.requirement("R-09")
 def test_a_fault_of_a_motor_is_read_by_the_client(rig: Rig) -> None:
     servo = rig.up()
     rig.ask(fault="error", joint="two_4", value=0xC)
@@ -138,7 +136,6 @@ def test_a_fault_of_a_motor_is_read_by_the_client(rig: Rig) -> None:
     rig.until(servo, lambda state: state.phases == UP)
 
 
-@pytest.mark.requirement("R-09")
 def test_a_client_that_dies_leaves_arms_that_are_held_and_then_released(rig: Rig) -> None:
     servo = rig.up()
     servo.abandon()
@@ -152,7 +149,6 @@ def test_a_client_that_dies_leaves_arms_that_are_held_and_then_released(rig: Rig
     assert not any(rig.ask()[axis.joint]["on"] for axis in rig.axes)
 
 
-@pytest.mark.requirement("R-09")
 def test_a_new_client_takes_over_arms_that_are_held_without_letting_them_go(rig: Rig) -> None:
     first = rig.up()
     with pytest.raises(OpenArmError, match="in use by another process") as refusal:
@@ -166,7 +162,6 @@ def test_a_new_client_takes_over_arms_that_are_held_without_letting_them_go(rig:
     assert second.alive
 
 
-@pytest.mark.requirement("R-09")
 def test_motors_of_a_servo_that_dies_switch_themselves_off_and_a_new_one_says_so(rig: Rig) -> None:
     servo = rig.up()
     os.kill(servo.pid, signal.SIGKILL)
