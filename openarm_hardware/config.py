@@ -75,8 +75,9 @@ class MotorConfig(Config):
 class HardwareNodeConfig(Config):
     """Motors of a robot, and the controllers before them."""
 
-    emulator: str = Field(
-        default="", description="folder of the sockets of emulated motors, one of each arm; empty: hardware.yaml"
+    emulated: bool = Field(default=False, description="whether the motors are those of the simulated robot")
+    motor_sockets: str = Field(
+        default="", description="folder of the sockets of emulated motors; empty: by the ROS domain, without files"
     )
     calibrations: str = Field(
         default="",

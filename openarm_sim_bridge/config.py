@@ -38,7 +38,8 @@ class BridgeConfig(Config):
         " /clock, and stamps are of the wall clock",
     )
     motor_sockets: str = Field(
-        default="", description="folder of the motors' sockets, one of each arm; needed where controllers are motors"
+        default="",
+        description="folder of the motors' sockets, one of each arm; empty: by the ROS domain, without files",
     )
     calibrations: str = Field(
         default="", description="folder of calibrations, which holds identified servos; empty: the default one"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import numpy as np
 
@@ -28,7 +27,7 @@ class EmulatedRobot(JointController):
     Args:
         description: The robot.
         world: Whose actuators they are.
-        folder: Of the sockets; each has the name of its arm. Made where it is missing.
+        addresses: Of the bus of each arm.
         clock: Of the motors' timeouts, ns.
 
     Attributes:
@@ -39,12 +38,10 @@ class EmulatedRobot(JointController):
         self,
         description: RobotDescription,
         world: World,
-        folder: Path,
+        addresses: Mapping[str, str],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._clock = clock
-        folder.mkdir(parents=True, exist_ok=True)
-        addresses: Mapping[str, str] = {name: f"unix:{folder / name}" for name in description.arm_names}
         wiring = load_wiring()
         axes = {axis.joint: axis for axis in axes_of(wiring, description, addresses)}
         self.joint_names, self._world = world.joint_names, world

@@ -255,11 +255,27 @@ class PythonCanBus(Bus):
             raise OSError(errno.EIO, f"{self.address}: {said(error)}") from error
 
 
+def unix_name(path: str) -> str:
+    """Return the name of a local socket; one that begins with @ is no file and ends with its process."""
+    return f"\0{path[1:]}" if path.startswith("@") else path
+
+
+def emulated_buses(domain: int, arms: Sequence[str], folder: str = "") -> dict[str, str]:
+    """Return the addresses of the buses of emulated motors, by arm.
+
+    Args:
+        domain: ROS domain, by which those of several graphs differ.
+        arms: Names.
+        folder: Of their sockets; empty: they are no files.
+    """
+    return {arm: f"unix:{folder}/{arm}" if folder else f"unix:@openarm_motors_{domain}_{arm}" for arm in arms}
+
+
 def open_bus(address: str, *, flexible: bool = True) -> Bus:
     """Open a bus.
 
     Args:
-        address: `socketcan:INTERFACE`, `unix:PATH` (of an emulator) or `python-can:INTERFACE:CHANNEL`.
+        address: `socketcan:INTERFACE`, `unix:PATH` or `unix:@NAME` (of an emulator) or `python-can:INTERFACE:CHANNEL`.
         flexible: Whether frames are sent as CAN FD.
 
     Raises:
@@ -271,7 +287,7 @@ def open_bus(address: str, *, flexible: bool = True) -> Bus:
             return SocketBus(_can_socket(rest, flexible=flexible), address, flexible=flexible)
         if kind == "unix" and rest:
             connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            connection.connect(rest)
+            connection.connect(unix_name(rest))
             return SocketBus(connection, address, flexible=flexible)
     except OSError as error:
         todo = f"`ip link show {rest}` says whether it is up" if kind == "socketcan" else "is the emulator running?"

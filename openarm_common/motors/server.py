@@ -11,7 +11,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from openarm_common.motors.bus import Frame, SocketBus
+from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.motors.bus import Frame, SocketBus, unix_name
 from openarm_common.motors.emulated import EmulatedBuses
 
 
@@ -22,6 +23,9 @@ class BusServer:
         buses: Their addresses are `unix:PATH`.
         advance: Moves what the motors move until a time, ns.
         flexible: Whether replies are CAN FD.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when a socket can't be made.
     """
 
     def __init__(self, buses: EmulatedBuses, advance: Callable[[int], None], *, flexible: bool = True) -> None:
@@ -31,10 +35,16 @@ class BusServer:
         self._late: list[tuple[int, int, SocketBus, list[Frame]]] = []
         self._count = 0
         for address in buses.addresses:
-            path = Path(address.removeprefix("unix:"))
-            path.unlink(missing_ok=True)
+            path = address.removeprefix("unix:")
             listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            listener.bind(str(path))
+            try:
+                if not path.startswith("@"):
+                    Path(path).unlink(missing_ok=True)
+                listener.bind(unix_name(path))
+            except OSError as error:
+                listener.close()
+                text = f"can't serve emulated motors at {address}: {said(error)}; does another robot run there?"
+                raise OpenArmError(Code.ENVIRONMENT, text) from error
             listener.listen()
             self._listeners[listener.fileno()] = listener, address
 
@@ -64,7 +74,8 @@ class BusServer:
             client.close()
         for listener, address in self._listeners.values():
             listener.close()
-            Path(address.removeprefix("unix:")).unlink(missing_ok=True)
+            if not address.startswith("unix:@"):
+                Path(address.removeprefix("unix:")).unlink(missing_ok=True)
 
     def _answer(self, fd: int, now_ns: int) -> None:
         client, address = self._clients[fd]

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from openarm_common.errors import OpenArmError
+from openarm_common.motors.bus import emulated_buses
 from openarm_common.motors.wiring import Wiring, axes_of, load_wiring
 from openarm_common.robot.servos import ArmLoad, ServoModel
 from openarm_common.ros.node import run
@@ -47,11 +48,10 @@ class OpenArmHardware(ControlNode[HardwareNodeConfig]):
         super().__init__("openarm_hardware", HardwareNodeConfig, **kwargs)
         config, description = self.config, self.description
         wiring, loads = load_wiring(), arm_loads(description)
-        emulator = config.emulator
-        buses = {name: f"unix:{emulator}/{name}" for name in description.arm_names} if emulator else None
-        self._axes = axes_of(wiring, description, buses)
+        sockets = emulated_buses(self.context.get_domain_id(), description.arm_names, config.motor_sockets)
+        self._axes = axes_of(wiring, description, sockets if config.emulated else None)
         self._settings = config.motors.settings(flexible=wiring.flexible)
-        self._posture = LastPosture(config.calibrations, "_emulated" if emulator else "")
+        self._posture = LastPosture(config.calibrations, "_emulated" if config.emulated else "")
         seed = None if config.dynamics_seed < 0 else config.dynamics_seed
         known = {side: _servo_model(config, wiring, load) for side, load in loads.items()}
         servos = KnownServos(known, config.calibrations, seed, self.get_logger().warning)

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.motors.bus import emulated_buses
 from openarm_common.ros.node import BaseNode
 from openarm_control.controller import JointController
 from openarm_control.joints import JointReadout
@@ -145,18 +144,16 @@ class MotorFace(Face):
         world: The world.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, when no folder of sockets is given, or the robot's motors are not known.
+        OpenArmError: CONFIG_INVALID, when the robot's motors are not known; ENVIRONMENT, when a socket can't be made.
     """
 
     wall_stamps = True
     speaks = False
 
     def __init__(self, node: BaseNode[Any], config: BridgeConfig, stage: Stage, world: World) -> None:
-        if not config.motor_sockets:
-            text = "controllers are motors, and motor_sockets is empty; expected a folder for their sockets"
-            raise OpenArmError(Code.CONFIG_INVALID, text)
         world.reset(stage.posture("zero"))  # arms without power hang
-        self.controller = self._robot = EmulatedRobot(node.description, world, Path(config.motor_sockets))
+        buses = emulated_buses(node.context.get_domain_id(), node.description.arm_names, config.motor_sockets)
+        self.controller = self._robot = EmulatedRobot(node.description, world, buses)
 
     def serve(self, simulation: Simulation) -> None:
         """See `Face.serve`."""

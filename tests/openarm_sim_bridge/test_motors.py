@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import OpenArmError
-from openarm_common.motors.bus import open_bus
+from openarm_common.motors.bus import emulated_buses, open_bus
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_control.joints import arm_loads
@@ -36,7 +36,12 @@ class Rig:
         stage = Stage(self.description, {}, None, PhysicsConfig(), HardwareConfig())
         world = self.world = stage.world(load_scene("empty"), each_step=True)
         world.reset(stage.posture("zero"))
-        self.motors = EmulatedRobot(self.description, world, folder, clock=lambda: world.t_ns)
+        self.motors = EmulatedRobot(
+            self.description,
+            world,
+            emulated_buses(0, self.description.arm_names, str(folder)),
+            clock=lambda: world.t_ns,
+        )
         self.robot = SimulatedRobot(self.description, world, self.motors)
         self.robot.faults.motors = self.motors.buses
         self.axes = tuple(motor.axis for motor in self.motors.buses.motors)
