@@ -104,7 +104,7 @@ class Bench:
         began = time.monotonic()
         while (t := time.monotonic() - began) < seconds:
             rows = zip(self._start, self._home, self.axes, strict=True)
-            self.servo.command([(q if a.grips else to(t, q, home), 1.0) for q, home, a in rows])
+            self.servo.command([(q, 1.0) if a.grips else (to(t, q, home), 0.0) for q, home, a in rows])
             time.sleep(0.01)
 
     def cpu_s(self) -> float:
@@ -158,6 +158,7 @@ def measured(rate: float, fifo: bool, seconds: float, trials: int, silent: int) 
     bench = Bench(settings, 70)
     try:
         bench.up()
+        bench.back()
         before, cpu, began = bench.servo.state(), bench.cpu_s(), time.monotonic()
         bench.move(seconds)
         after, share = bench.servo.state(), (bench.cpu_s() - cpu) / (time.monotonic() - began)

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm_hardware` before the emulated motors of the simulated robot: what the bridge offers, down to the frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.node import QOS_COMMAND
+from openarm_hardware.ros.node import OpenArmHardware
+from openarm_sim_bridge.ros.node import MujocoBridge
+from tests.nodes.conftest import Bench as BridgeBench
+
+pytestmark = pytest.mark.alone
+
+#: The robot, its node and this test are one process, none of them in real time.
+PATIENT = {"motors.silent": 200, "motors.stale": 2.0, "motors.timeout": 3.0, "motors.ramp": 0.2, "stale_after": 2.0}
+START = [0.05, 0.05, 0.0, 0.05, 0.0, 0.0, 0.0]
+
+
+class Bench(BridgeBench):
+    """The bridge as motors, and the node before it."""
+
+    def __init__(self, ros, folder: Path) -> None:
+        made = {"profile": "openarm", "controllers": "motors", "scene": "empty", "images": False}
+        self.ros = ros
+        self.node = ros.add(MujocoBridge(parameter_overrides=[Parameter(k, value=v) for k, v in made.items()]))
+        self.joints, self.joint_arrivals = list[JointState](), list[float]()
+        ros.node.create_subscription(JointState, "/joint_states", self._on_joints, QOS_COMMAND)
+        self.reports: list[DiagnosticArray] = self.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+        values = {**PATIENT, "emulated": True, "calibrations": str(folder), "dynamics_seed": 1}
+        self.hardware = ros.add(OpenArmHardware(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()]))
+        ros.spin_until(
+            lambda: self.report().get("right_phase") == "FOLLOWING" and self.level() == b"\0", 30.0, "arms up"
+        )
+
+    def level(self) -> bytes:
+        return self._status().level if self._status() else b"\2"
+
+    def _status(self):
+        found = [s for m in self.reports for s in m.status if s.name.startswith("openarm_hardware")]
+        return found[-1] if found else None
+
+    def message(self) -> str:
+        return self._status().message if self._status() else ""
+
+    def report(self) -> dict[str, str]:
+        """The newest values of the node on /diagnostics."""
+        status = self._status()
+        return {value.key: value.value for value in status.values} if status else {}
+
+
+@pytest.fixture
+def bench(ros, tmp_path: Path) -> Bench:
+    return Bench(ros, tmp_path)
+
+
+def test_the_arms_move_and_the_hand_closes_as_on_the_bridge(bench: Bench) -> None:
+    goal = bench.goal((0.5, START), (2.5, [q + 0.6 * (i == 1) for i, q in enumerate(START)]))
+    _, result = bench.follow(goal)
+    answer = bench.ros.result(result, 20.0).result
+    assert answer.error_code == 0, answer.error_string
+    bench.spin_sim(0.5)
+    assert bench.arm[1] == pytest.approx(0.65, abs=0.02)
+    newest = bench.joints[-1]
+    shoulder = newest.name.index(bench.ARM[1])
+    assert abs(newest.effort[shoulder]) > 1.0  # the weight of the arm, in the motor's reply
+    steps = np.diff([stamp_to_ns(message.header.stamp) for message in bench.joints[-100:]])
+    assert 8e6 < np.median(steps) < 14e6
+    bench.grip(0.03)
+    assert bench.position(bench.FINGER) == pytest.approx(0.03, abs=0.002)
+    values = bench.report()
+    assert float(values["period_p50_ms"]) > 0.0
+    assert values[bench.ARM[0]].startswith("status 0x1, 35 °C")
+    assert {"frames_lost", "bus_errors", "scheduling", "cycles_left_out", "left_phase"} <= values.keys()
+    assert (Path(bench.hardware.config.calibrations) / "last_posture_emulated.json").is_file()
+
+
+def test_a_fault_of_a_motor_ends_the_goal_by_name_and_is_reset_when_it_is_gone(bench: Bench) -> None:
+    goal = bench.goal((0.5, START), (6.0, [q + 0.6 * (i == 1) for i, q in enumerate(START)]))
+    _, result = bench.follow(goal)
+    bench.spin_sim(1.5)
+    bench.inject("motor_fault", f"{{kind: error, joint: {bench.ARM[2]}, value: 12}}")
+    answer = bench.ros.result(result, 20.0).result
+    assert bench.ARM[2] in answer.error_string
+    assert "rotor too hot" in answer.error_string
+    bench.ros.spin_until(lambda: bench.report().get("right_phase") == "DAMPED", 10.0, "the arm sinks")
+    assert bench.report()["left_phase"] == "HELD"
+    assert bench.level() != b"\0"
+    _, refused = bench.follow(bench.goal((1.0, START)))
+    assert "rotor too hot" in bench.ros.result(refused, 10.0).result.error_string
+    bench.clear()
+    bench.call(Trigger, "/openarm_hardware/reset")
+    bench.ros.spin_until(lambda: bench.level() == b"\0", 20.0, "the arms are up again")
+    here = [max(0.01, float(q)) if i == 3 else float(q) for i, q in enumerate(bench.arm)]
+    _, result = bench.follow(bench.goal((1.5, here)))
+    assert bench.ros.result(result, 20.0).result.error_code == 0
+
+
+def test_the_emergency_stop_holds_the_motors_until_reset(bench: Bench) -> None:
+    goal = bench.goal((0.5, START), (6.0, [q + 0.8 * (i == 1) for i, q in enumerate(START)]))
+    _, result = bench.follow(goal)
+    bench.spin_sim(2.0)
+    assert bench.call(Trigger, "/stop").success
+    assert "emergency stop" in bench.ros.result(result, 10.0).result.error_string
+    bench.ros.spin_until(lambda: bench.report().get("right_phase") == "HELD", 10.0, "the motors hold")
+    bench.spin_sim(0.5)
+    held = bench.arm
+    bench.spin_sim(0.5)
+    assert bench.arm == pytest.approx(held, abs=0.01)
+    assert bench.call(Trigger, "/openarm_hardware/reset").success
+    bench.ros.spin_until(lambda: bench.level() == b"\0", 20.0, "the arms follow again")
+    assert bench.arm == pytest.approx(held, abs=0.03)

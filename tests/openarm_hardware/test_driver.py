@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From targets of the controllers to commands of the motors, and what is kept from run to run."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from openarm_common.errors import OpenArmError
+from openarm_common.motors.bus import emulated_buses
+from openarm_common.motors.wiring import axes_of, load_wiring
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import robot_names
+from openarm_control.arm import TrajectoryConfig
+from openarm_control.controller import RobotController
+from openarm_control.gripper import GripperConfig
+from openarm_control.joints import JointReadout, arm_groups, arm_loads, carriers, gripper_groups, joint_names
+from openarm_control.servos import ServoConfig
+from openarm_hardware.arm import Phase
+from openarm_hardware.driver import MotorDriver
+from openarm_hardware.exchange import MotorState, State
+from openarm_hardware.loop import MotorRobot
+from openarm_hardware.posture import LastPosture
+
+FOLLOWS = (Phase.FOLLOWING, Phase.FOLLOWING)
+
+
+class Servo:
+    """What the driver needs of a servo process."""
+
+    def __init__(self, description: RobotDescription) -> None:
+        self.axes = axes_of(load_wiring(), description, emulated_buses(0, description.arm_names))
+        self.alive = True
+        self.told: list[str] = []
+        self.commands: list[list[tuple[float, float]]] = []
+        self.q = np.array([0.5 * (axis.lower + axis.upper) for axis in self.axes])
+        self.commanded = self.q + 0.01
+        self.phases: tuple[int, ...] = FOLLOWS
+        self.text = ""
+        self.cycles = 0
+
+    def state(self) -> State:
+        self.cycles += 1
+        rows = zip(self.q.tolist(), self.commanded.tolist(), strict=True)
+        motors = tuple(MotorState(q, 0.1, 0.5, c, 0.2, 1, 40, 41, 0) for q, c in rows)
+        return State(time.monotonic_ns(), self.cycles, 0, self.phases, 0, self.text, motors)
+
+    def command(self, joints: list[tuple[float, float]]) -> None:
+        self.commands.append(joints)
+
+    def stop(self) -> None:
+        self.told.append("stop")
+
+    def reset(self) -> None:
+        self.told.append("reset")
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.description = description = RobotDescription.load()
+        names, self.loads = joint_names(description), arm_loads(description)
+        servos = {side: ServoConfig().model(load) for side, load in self.loads.items()}
+        config = TrajectoryConfig()
+        self.controller = RobotController(
+            arm_groups(description),
+            gripper_groups(description),
+            names,
+            JointReadout(0, *np.zeros((3, len(names)))),
+            dict.fromkeys(description.arm_names, 30.0),
+            config,
+            GripperConfig(),
+            carriers(description, config.carrier, servos),
+        )
+        self.servo: Any = Servo(description)
+        self.published: list[JointReadout] = []
+        self.driver = MotorDriver(self.servo, self.controller, self.loads, self.published.append)
+        self.robot = MotorRobot(self.controller, self.driver, 5.0, lambda _: None)
+        self.kp = np.array([axis.kp for axis in self.servo.axes])
+        self.arms = self.kp > 0.0
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+@pytest.mark.parametrize("robot", robot_names())
+def test_the_folder_of_a_robot_says_where_its_motors_are(robot: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENARM_ROBOT", robot)
+    description = RobotDescription.load(robot)
+    axes = axes_of(load_wiring(), description)
+    assert tuple(axis.joint for axis in axes) == joint_names(description)
+    assert len({(axis.bus, axis.id) for axis in axes}) == len(axes)
+    for axis in axes:
+        for q in (axis.lower, axis.upper):
+            assert abs(q * axis.ratio + axis.offset) < 12.5
+    for hand in description.hands.values():
+        axis = next(axis for axis in axes if axis.joint == hand.joint)
+        turned = (hand.opened - hand.closed) * axis.ratio
+        assert 0.1 < abs(turned) < 2.0
+        assert np.sign(turned) == np.sign(load_wiring().gripper.ratio)  # motors of both hands open alike
+
+
+def test_motors_pull_as_the_target_says_and_carry_the_weight_by_torque(bench: Bench) -> None:
+    driver, servo = bench.driver, bench.servo
+    readout = driver.take()
+    assert readout is not None
+    assert readout is bench.published[0]
+    assert driver.fault() == ""
+    targets = servo.q + np.linspace(-0.1, 0.1, len(servo.q))
+    driver.send(targets)
+    command = np.array(servo.commands[-1])
+    pull = bench.kp * (command[:, 0] - servo.q) + command[:, 1]
+    assert pull[bench.arms] == pytest.approx((bench.kp * (targets - servo.q))[bench.arms])
+    weights = np.concatenate(
+        [
+            load.torque(servo.q[8 * i : 8 * i + 7], np.zeros(7), np.zeros(7))
+            for i, load in enumerate(bench.loads.values())
+        ]
+    )
+    assert command[bench.arms, 1] == pytest.approx(weights)
+    assert command[~bench.arms] == pytest.approx(np.stack([targets[~bench.arms], [30.0, 30.0]], axis=1), rel=0.2)
+    servo.commanded = command[:, 0]
+    driver.take()
+    known = driver.targets(0)
+    expected = np.where(bench.arms, servo.commanded + 0.2 / np.where(bench.arms, bench.kp, 1.0), servo.commanded)
+    assert known == pytest.approx(expected)
+
+
+def test_a_step_of_the_controllers_is_spread_over_commands(bench: Bench) -> None:
+    bench.driver.take()
+    bench.driver.send(bench.servo.q)
+    bench.driver.send(bench.servo.q + np.where(bench.arms, 0.35, 0.0))
+    steps = np.diff(np.array(bench.servo.commands)[:, :, 0], axis=0)
+    assert steps[0][bench.arms] == pytest.approx(0.1)
+    for _ in range(4):
+        bench.driver.send(bench.servo.q + np.where(bench.arms, 0.35, 0.0))
+    total = np.array(bench.servo.commands[-1])[:, 0] - np.array(bench.servo.commands[0])[:, 0]
+    assert total[bench.arms] == pytest.approx(0.35)
+
+
+def test_arms_that_do_not_follow_are_told_to_stay(bench: Bench) -> None:
+    servo = bench.servo
+    servo.phases, servo.text = (Phase.SETTING, Phase.HELD), "two: the emergency stop is latched"
+    bench.driver.take()
+    assert bench.driver.fault() == servo.text
+    command = np.array(servo.commands[-1])[:, 0]
+    assert command[:8] == pytest.approx(servo.q[:8])
+    assert command[8:] == pytest.approx(servo.commanded[8:])
+    servo.alive = False
+    assert "process that commands the motors has ended" in bench.driver.fault()
+
+
+def test_the_emergency_stop_and_its_reset_are_those_of_the_motors(bench: Bench) -> None:
+    bench.robot.stop_motion()
+    assert bench.servo.told == ["stop"]
+    with pytest.raises(OpenArmError, match="emergency stop"):
+        bench.robot.check_able()
+    bench.servo.phases, bench.servo.text = (Phase.HELD, Phase.FOLLOWING), "not reset: one_1 reports: overload"
+    assert "overload" in bench.robot.release()
+    bench.servo.phases = FOLLOWS
+    assert bench.robot.release() == ""
+    assert bench.servo.told == ["stop", "reset", "reset"]
+
+
+def test_where_the_joints_were_is_kept_by_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    posture = LastPosture(str(tmp_path / "new"))
+    assert posture.read() == {}
+    assert posture.write({"a": 0.5, "b": float("nan")}) == ""
+    assert posture.read() == {"a": 0.5}
+    monkeypatch.setenv("OPENARM_ROBOT", robot_names()[-1])
+    assert posture.read() == {}
+    posture.path.write_text("[1, 2")
+    assert posture.read() == {}
+    assert "can't store" in LastPosture("/proc/none").write({"a": 0.5})
