@@ -43,7 +43,7 @@ Exit code 0: what was asked happened. 1: it did not; a code and a sentence say w
 COMMANDS = {
     "Run": (f"{EVALUATION}.demo:demo", "up:up", "view:view", "stop:stop", "calibrate:calibrate"),
     "Grasp": ("pick:pick", "pick:order", f"{EVALUATION}.campaign:campaign"),
-    "Inspect": ("processes:ps", "processes:logs", "doctor:doctor", "tf:tf"),
+    "Inspect": ("processes:ps", "processes:logs", "doctor:doctor", "tf:tf", "hardware:hardware"),
     "Messages": ("ros2:topic", "ros2:service", "ros2:action", "ros2:node", "ros2:param"),
     "Record and check": ("record:record", "record:replay", "record:check"),
     "Models and graphs": ("model:model", "graph:graph", "grasp:grasp", f"{EVALUATION}.detector:detector"),

@@ -16,10 +16,12 @@ from typing import Any
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.motors.wiring import load_wiring
 from openarm_hardware.arm import Phase
 from openarm_hardware.client import ServoProcess
 from openarm_hardware.emulator import request
 from openarm_hardware.exchange import State
+from openarm_hardware.scan import scanned
 from openarm_hardware.settings import Settings
 from tests.openarm_hardware.bench import made_axes
 
@@ -186,3 +188,21 @@ def test_a_bus_that_is_not_there_is_refused(tmp_path: Path) -> None:
         axes = made_axes((bus, bus))
         with pytest.raises(OpenArmError, match=text):
             ServoProcess(axes, PATIENT)
+
+
+def test_a_scan_lists_the_motors_that_answer_and_switches_none_on(rig: Rig) -> None:
+    wiring = load_wiring()
+    rig.ask(fault="silent", joint="one_3")
+    found = scanned(list(dict.fromkeys(axis.bus for axis in rig.axes)), wiring)
+    assert len(found) == 15
+    first, finger = found[0], found[6]
+    assert (first.id, first.status, first.mode, first.timeout_s, first.ranges) == (
+        1,
+        "disabled",
+        "MIT",
+        0.0,
+        (12.5, 45.0, 54.0),
+    )
+    assert first.q == pytest.approx(0.3, abs=0.001)
+    assert (finger.id, finger.celsius, finger.firmware) == (8, 35, 5015)
+    assert not any(rig.ask()[axis.joint]["on"] for axis in rig.axes)
