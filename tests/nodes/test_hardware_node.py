@@ -21,7 +21,15 @@ from tests.nodes.conftest import Bench as BridgeBench
 pytestmark = pytest.mark.alone
 
 #: The robot, its node and this test are one process, none of them in real time.
-PATIENT = {"motors.silent": 200, "motors.stale": 2.0, "motors.timeout": 3.0, "motors.ramp": 0.2, "stale_after": 2.0}
+PATIENT = {
+    "motors.silent": 200,
+    "motors.stale": 2.0,
+    "motors.timeout": 3.0,
+    "motors.ramp": 0.2,
+    "motors.tracking": 1.5,
+    "trajectory.path_tolerance": 1.0,
+    "stale_after": 2.0,
+}
 START = [0.05, 0.05, 0.0, 0.05, 0.0, 0.0, 0.0]
 
 
