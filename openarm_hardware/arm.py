@@ -68,6 +68,8 @@ class ArmMachine:
         self._since_ns = 0
         #: Its motors are on and damped while it looks: it was reset.
         self._sinks = False
+        #: Somebody has looked, so that errors of motors may be cleared.
+        self._clears = False
         #: Its motors were switched on here.
         self._was_on = False
 
@@ -123,9 +125,7 @@ class ArmMachine:
             return [m.frame() if m.status == Status.ENABLED else off(m.axis.id) for m in self.motors]
         if phase is Phase.OFF:
             return [frames.disable(motor.axis.id) for motor in self.motors] if again and self._was_on else []
-        if self._sinks:
-            return [self._sinking(motor, again=again) for motor in self.motors]
-        return [motor.configure(write=phase is Phase.SETTING) for motor in self.motors]
+        return [self._question(motor, again=again) for motor in self.motors]
 
     # --- what others ask
     def fail(self, why: str, now_ns: int) -> None:
@@ -152,7 +152,8 @@ class ArmMachine:
             self._become(Phase.FOLLOWING, "", now_ns)
         elif self.phase in (Phase.DAMPED, Phase.REFUSED):
             self._sinks = self._sinks or self.phase is Phase.DAMPED
-            self._last.clear()  # somebody has looked
+            self._last.clear()
+            self._clears = True
             for motor in self.motors:
                 motor.forget()
                 motor.share = 0.0
@@ -189,11 +190,12 @@ class ArmMachine:
             self.text = f"no reply of {_named(silent)}; is the arm's power on, its bus up?"
             return
         if unread := [motor for motor in self.motors if len(motor.registers) < 3]:
-            self.text = f"asking {_named(unread)}"
+            errors = [motor.fault for motor in unread if motor.broken]
+            self.text = errors[0] if errors else f"asking {_named(unread)}"
             return
         for motor in self.motors:
             last = self._last.get(motor.axis.joint)
-            why = motor.scaled or (motor.fault if motor.status not in (0, 1) else "") or motor.misplaced(last)
+            why = motor.scaled or (motor.fault if motor.broken else "") or motor.misplaced(last)
             if why:
                 self._become(Phase.REFUSED, why, now_ns)
                 return
@@ -249,12 +251,13 @@ class ArmMachine:
         if passed > self._settings.release_s or (rests and passed > 0.5):
             self._become(Phase.OFF, self.text, now_ns)
 
-    def _sinking(self, motor: MotorAxis, *, again: bool) -> Frame:
-        """Of an arm that was reset: clear errors, read and set registers, and damp in between."""
-        if motor.status not in (Status.ENABLED, Status.DISABLED):
+    def _question(self, motor: MotorAxis, *, again: bool) -> Frame:
+        """Of an arm that looks: read and set registers; when it was reset, clear errors, and damp what sinks."""
+        if self._clears and motor.broken:
             return frames.clear_error(motor.axis.id) if again else motor.refresh_frame()
         asks = motor.configure(write=self.phase is Phase.SETTING)
-        return asks if self._cycles % 2 and asks != motor.refresh_frame() else motor.damping_frame()
+        damps = self._sinks and not (self._cycles % 2 and asks != motor.refresh_frame())
+        return motor.damping_frame() if damps else asks
 
     def _become(self, phase: Phase, why: str, now_ns: int) -> None:
         self.phase, self.text, self._since_ns = phase, why, now_ns

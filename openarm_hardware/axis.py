@@ -86,6 +86,11 @@ class MotorAxis:
         return self.status >= 0 and self.missed == 0
 
     @property
+    def broken(self) -> bool:
+        """Whether it reports an error."""
+        return self.status not in (Status.ENABLED, Status.DISABLED, -1)
+
+    @property
     def gone(self) -> bool:
         """Whether too many replies are missing."""
         return self.missed >= self._settings.silent

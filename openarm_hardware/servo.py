@@ -276,6 +276,7 @@ def main() -> int:
         return 2
     exchange = Exchange(int(sys.argv[1]), len(axes), len(machine.arms))
     servo = Servo(machine, links, exchange, settings, owner)
+    signal.signal(signal.SIGTERM, lambda *_: machine.release("ended by a signal", time.monotonic_ns()))
     os.write(1, f"OK {schedule(settings.priority)}\n".encode())
     servo.run()
     return 0

@@ -234,6 +234,8 @@ def test_what_is_wrong_at_the_start_is_refused() -> None:
     bench.run(0.3)
     assert bench.phases[0] is Phase.REFUSED
     assert "under voltage" in bench.machine.text
+    bench.machine.reset(bench.now_ns)
+    bench.up()
 
 
 def test_lost_and_late_replies_are_no_false_alarm() -> None:

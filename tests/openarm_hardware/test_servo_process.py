@@ -176,7 +176,9 @@ def test_motors_of_a_servo_that_dies_switch_themselves_off_and_a_new_one_says_so
     state = rig.until(again, lambda state: state.phases == (Phase.REFUSED, Phase.REFUSED))
     assert "lost communication" in state.text
     again.reset()
-    state = rig.until(again, lambda state: state.phases[0] is not Phase.REFUSED)
+    rig.until(again, lambda state: state.phases == UP)
+    os.kill(again.pid, signal.SIGTERM)
+    rig.until(again, lambda state: state.phases == (Phase.OFF, Phase.OFF), client=False)
 
 
 def test_a_bus_that_is_not_there_is_refused(tmp_path: Path) -> None:
