@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Things on a table, each with its pixels, its points and what is known of its shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.types import Array, Bytes, Mask
+from openarm_perception.geometry.depth import Points
+from openarm_perception.segmentation.divide import SegmentationConfig, divide
+from openarm_perception.segmentation.outline import Outline, survey
+from openarm_perception.segmentation.shape import Shape, judge
+from openarm_perception.segmentation.support import Support, find_support
+
+
+@dataclass(frozen=True, eq=False)
+class Cluster:
+    """A thing that was seen.
+
+    Attributes:
+        id: Its number in the label image.
+        window: Rows and columns of the image around it.
+        mask: (h, w) bool, its pixels within the window.
+        points: (n, 3) float32 of those pixels, in row order, m; base frame, or the camera's where
+            its pose is not known.
+        height: Of its highest place over the support, m.
+        outline: What lies beyond its outline.
+        shape: Whether a prism fits it.
+        T_frame_box: (4, 4) middle of the box around it, in the frame of the points; z away from the support.
+        size: (3,) of that box, m; x is the smaller horizontal edge.
+        color: Median (r, g, b), 0 to 255; None without a colour image.
+    """
+
+    id: int
+    window: tuple[slice, slice]
+    mask: Mask
+    points: Points
+    height: float
+    outline: Outline
+    shape: Shape
+    T_frame_box: Array
+    size: Array
+    color: tuple[int, int, int] | None
+
+    @property
+    def pixels(self) -> int:
+        """How many pixels with a depth it has."""
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """What stands on a support.
+
+    Attributes:
+        label: (h, w) uint16, 0: no thing; else the `id` of a cluster.
+        clusters: Largest (area) first; their ids are 1, 2, …
+        support: What they stand on.
+        heights: (h, w) float32 over it, m; NaN where nothing was measured.
+    """
+
+    label: NDArray[np.uint16]
+    clusters: tuple[Cluster, ...]
+    support: Support
+    heights: NDArray[np.float32]
+
+
+def segment(
+    points: Points,
+    intrinsics: Intrinsics,
+    config: SegmentationConfig = SegmentationConfig(),  # noqa: B008 - frozen
+    *,
+    rgb: Bytes | None = None,
+    T_base_camera: Array | None = None,
+    robot: Mask | None = None,
+) -> Segmentation:
+    """Find what stands on the table in the organised cloud of one camera.
+
+    Args:
+        points: (h, w, 3) float32, optical frame, m; NaN where nothing was measured.
+        intrinsics: Of the camera.
+        config: What counts as a thing.
+        rgb: (h, w, 3) uint8 aligned with it: clusters have a colour then.
+        T_base_camera: (4, 4) optical frame in the base frame, whose z points up; None: the support may be slanted.
+        robot: (h, w) pixels that show the robot or what it holds.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED, when there is no plane that things may stand on.
+    """
+    robot = np.zeros(points.shape[:2], np.bool_) if robot is None else robot
+    seen = points
+    if robot.any():
+        seen = points.copy()
+        seen[robot] = np.nan
+    support = find_support(seen, None if T_base_camera is None else T_base_camera[2, :3])
+    divided = divide(points, intrinsics, support, config, robot)
+    outlines = survey(divided.label, points, robot, support.noise)
+    pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
+    T_plane_camera = se3.make(np.stack([*support.axes.T, support.normal]), (0.0, 0.0, support.offset))
+    T = np.eye(4) if T_base_camera is None else T_base_camera
+    T_frame_plane = T @ se3.inverse(T_plane_camera)
+    found: list[Cluster] = []
+    for i, outline in enumerate(outlines, start=1):
+        window = _window(divided.label, i)
+        mask = divided.label[window] == i
+        local = points[window]
+        flat, rays = _in_plane(local, intrinsics, window, T_plane_camera)
+        z = float(np.median(local[..., 2][mask]))
+        shape = judge(mask, flat, rays, support.offset, outline.cut, pixel * z, support.noise * z * z)
+        T_plane_box = se3.make(se3.rot_z(shape.footprint.yaw), (*shape.footprint.centre, shape.height / 2.0))
+        color = None
+        if rgb is not None:
+            r, g, b = (int(v) for v in np.median(rgb[window][mask], axis=0))
+            color = (r, g, b)
+        placed = local[mask] @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
+        size = np.array([*shape.footprint.size, shape.height])
+        found.append(
+            Cluster(i, window, mask, placed, shape.height, outline, shape, T_frame_plane @ T_plane_box, size, color)
+        )
+    return Segmentation(divided.label, tuple(found), support, divided.heights)
+
+
+def _window(label: NDArray[np.uint16], i: int) -> tuple[slice, slice]:
+    """Return rows and columns around a thing, with one pixel more on each side where the image has one."""
+    on = label == i
+    rows, columns = np.nonzero(on.any(axis=1))[0], np.nonzero(on.any(axis=0))[0]
+    top, left = max(int(rows[0]) - 1, 0), max(int(columns[0]) - 1, 0)
+    return slice(top, int(rows[-1]) + 2), slice(left, int(columns[-1]) + 2)
+
+
+def _in_plane(
+    points: Points, intrinsics: Intrinsics, window: tuple[slice, slice], T_plane_camera: Array
+) -> tuple[Points, Points]:
+    """Return points (h, w, 3) of a window under the camera's foot on the plane, and the rays of its pixels, there."""
+    R = T_plane_camera[:3, :3].astype(np.float32)
+    x, y = intrinsics.rays
+    height, width = points.shape[:2]
+    rays = np.ones((height, width, 3), np.float32)
+    rays[..., 0] = x[window[1]][:width]
+    rays[..., 1] = y[window[0]][:height, None]
+    return points @ R.T + T_plane_camera[:3, 3].astype(np.float32), rays @ R.T

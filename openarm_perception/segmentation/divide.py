@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pixels over the support divided among things."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.flying_pixels import label_lonely
+from openarm_common.config import Config
+from openarm_common.types import Array, Mask
+from openarm_perception.geometry.depth import Points
+from openarm_perception.segmentation.grouping import partition
+from openarm_perception.segmentation.kernels import (
+    SLANT,
+    Labels,
+    borders,
+    breaks,
+    edge_strength,
+    grow_patches,
+    masked_normals,
+    patch_moments,
+)
+from openarm_perception.segmentation.support import Support
+
+#: So much of a thing stands over what is seen of the support; walls and floors beyond it do not.
+_OVER = 0.5
+#: Points of a thing that are asked for that.
+_ASKED = 200
+#: Of its border with a larger thing, so much without a break in depth makes a small piece part of it.
+_GROWN_ON = 0.3
+
+
+class SegmentationConfig(Config):
+    """What counts as a thing."""
+
+    least_height: float = Field(default=0.004, gt=0.0, le=0.1, description="what is lower over the table is table, m")
+    sigmas: float = Field(
+        default=3.5, gt=0.0, le=10.0, description="and what is lower by as many standard deviations of the depth"
+    )
+    normal_deg: float = Field(
+        default=4.0, gt=0.0, le=20.0, description="patches are as large as it takes to know their normals so well, deg"
+    )
+    least_patch: int = Field(default=6, ge=4, le=64, description="smallest patch across, pixels")
+    most_patch: int = Field(default=16, ge=4, le=64, description="largest patch across, pixels")
+    least_size: float = Field(
+        default=0.012, gt=0.0, le=0.2, description="pieces that are smaller (root of the area) are no things, m"
+    )
+    least_pixels: int = Field(default=60, ge=12, description="nor are pieces of fewer pixels")
+
+
+@dataclass(frozen=True, eq=False)
+class Divided:
+    """Pixels of an image divided among things.
+
+    Attributes:
+        label: (h, w) uint16, 0: none; 1, 2, …: things, the largest (area) first.
+        patch: (h, w) int32, the patches of surface that they are made of.
+        heights: (h, w) float32 over the support, m.
+    """
+
+    label: NDArray[np.uint16]
+    patch: Labels
+    heights: NDArray[np.float32]
+
+
+def divide(
+    points: Points, intrinsics: Intrinsics, support: Support, config: SegmentationConfig, robot: Mask
+) -> Divided:
+    """Divide what rises above the support among things.
+
+    Args:
+        points: (h, w, 3) organised, optical frame, m.
+        intrinsics: Of the camera.
+        support: What things stand on.
+        config: What counts as a thing.
+        robot: (h, w) pixels that show the robot or what it holds.
+    """
+    pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
+    noise = np.float32(support.noise)
+    z = points[..., 2]
+    heights = support.heights(points)
+    wanted = _above(points, heights, support, config) & ~_flying(z, pixel, support.noise) & ~robot
+    size = _patch_size(z[wanted], pixel, support.noise, config)
+    broken = breaks(points, wanted, pixel, noise)
+    strength = edge_strength(masked_normals(points, wanted, max(2, size // 2), noise), wanted, max(2, size // 2))
+    patch = grow_patches(strength, broken, wanted, size)
+    moments = patch_moments(points, patch, int(patch.max()) + 1)
+    # metres across of a pixel at a patch, squared
+    area = moments[:, 0] * (pixel * moments[:, 3] / np.maximum(moments[:, 0], 1.0)) ** 2
+    border = borders(patch, broken)
+    root, _ = partition(moments, border, support.noise)
+    root = _join_small(root, patch, area, moments[:, 0], border, size, config)
+    number = _number(root, area, moments, support, config)
+    return Divided(number[patch], patch, heights)
+
+
+def _above(points: Points, heights: NDArray[np.float32], support: Support, config: SegmentationConfig) -> Mask:
+    """Return which pixels (h, w) rise above the support by more than the noise."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # noise acts along the ray; over a slanted plane it is less
+        facing = np.abs(points @ support.normal.astype(np.float32)) / np.linalg.norm(points, axis=-1)
+        limit = np.float32(config.sigmas * support.noise) * points[..., 2] ** 2 * facing
+        return heights > np.maximum(np.float32(config.least_height), limit)
+
+
+def _flying(z: NDArray[np.float32], pixel: float, noise: float) -> Mask:
+    """Return which pixels (h, w) float between surfaces."""
+    label = np.zeros(z.shape, np.uint8)
+    f = np.float32
+    label_lonely(np.nan_to_num(z), f(1.0), f(1e-3), f(1e3), f(SLANT * pixel), f(4.0 * noise), 4, label)
+    return label > 0
+
+
+def _patch_size(z: NDArray[np.float32], pixel: float, noise: float, config: SegmentationConfig) -> int:
+    """Return how many pixels across a patch must be so that its normal is known well enough."""
+    if not len(z):
+        return config.least_patch
+    depth = float(np.median(z))
+    # a plane through n² points a pixel apart: std of its direction = sqrt(12) · sigma / (n² · pixel)
+    n = math.sqrt(math.sqrt(12.0) * noise * depth / (pixel * math.radians(config.normal_deg)))
+    return int(np.clip(math.ceil(n), config.least_patch, config.most_patch))
+
+
+def _join_small(
+    root: Labels, patch: Labels, area: Array, pixels: Array, border: Labels, size: int, config: SegmentationConfig
+) -> NDArray[np.int32]:
+    """Join pieces that are too small to be things to those that they have grown on; return the groups (n,).
+
+    So are pieces that are nowhere as wide as a patch: of these no normal is known, as of the smeared edges of a box.
+    """
+    root = root.copy()
+    for _ in range(2):
+        extent = np.bincount(root, weights=area, minlength=len(root))
+        count = np.bincount(root, weights=pixels, minlength=len(root))
+        small = (extent < config.least_size**2) | (count < config.least_pixels)
+        small |= _half_width(root[patch], len(root)) < 0.5 * size
+        a, b = root[border[:, 0]], root[border[:, 1]]
+        a, b = np.concatenate([a, b]), np.concatenate([b, a])
+        between = small[a] & (a != b) & (extent[b] > extent[a])
+        if not between.any():
+            break
+        pairs, index = np.unique(np.stack([a[between], b[between]]), axis=1, return_inverse=True)
+        broken = np.tile(border[:, 2], 2)[between]
+        whole = np.bincount(index.ravel(), weights=1.0 - broken)
+        length = np.bincount(index.ravel())
+        to = np.arange(len(root))
+        for i in np.argsort(whole, kind="stable"):  # the longest last
+            if whole[i] >= _GROWN_ON * length[i]:
+                to[pairs[0, i]] = pairs[1, i]
+        root = to[root].astype(np.int32)
+    return root
+
+
+def _half_width(label: NDArray[np.int32], count: int) -> Array:
+    """Return the largest distance (count,) of a pixel of each label to the outside of it, pixels."""
+    edge = np.zeros(label.shape, np.bool_)
+    edge[:, 1:] |= label[:, 1:] != label[:, :-1]
+    edge[1:] |= label[1:] != label[:-1]
+    distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 3)
+    widest = np.zeros(count)
+    np.maximum.at(widest, label[label > 0], distance[label > 0])
+    return widest
+
+
+def _number(
+    root: Labels, area: Array, moments: Array, support: Support, config: SegmentationConfig
+) -> NDArray[np.uint16]:
+    """Return the numbers (n,) of the things that patches belong to, the largest first; 0 of what is none."""
+    size = np.bincount(root, weights=area, minlength=len(root))
+    count = np.bincount(root, weights=moments[:, 0], minlength=len(root))
+    number = np.zeros(len(root), np.uint16)
+    centre = moments[:, 1:4] / np.maximum(moments[:, :1], 1.0)
+    n = 0
+    for i in np.argsort(-size, kind="stable"):
+        if size[i] < config.least_size**2 or count[i] < config.least_pixels:
+            continue
+        members = np.nonzero((root == i) & (moments[:, 0] > 0.0))[0]
+        if support.share_over(centre[members[:: max(1, len(members) // _ASKED)]]) < _OVER:
+            continue
+        n += 1
+        number[i] = n
+    return number[root]
