@@ -115,8 +115,10 @@ def steps(patches: Patches, own: Array, pairs: Labels) -> Array:
     return np.where(parallel, step, 0.0)
 
 
-def votes(patches: Patches, own: Array, pairs: Labels, length: Array, broken: Array, noise: float) -> Array:
-    """Return the sums (n,) of the votes along the borders of pairs of patches.
+def votes(
+    patches: Patches, own: Array, pairs: Labels, length: Array, broken: Array, noise: float
+) -> tuple[Array, Array]:
+    """Return the sums (n,) of the votes along the borders of pairs of patches, and how many votes they count as.
 
     Args:
         patches: Their planes, which may reach beyond them.
@@ -129,12 +131,14 @@ def votes(patches: Patches, own: Array, pairs: Labels, length: Array, broken: Ar
     a, b = pairs.T
     apart = np.maximum(np.linalg.norm(patches.centre[a] - patches.centre[b], axis=1), 1e-6)
     notch = beyond_bend(notches(replace(patches, centre=own), pairs), apart, pairs, len(own))
-    # what is known badly says little, for or against
-    tolerance = np.hypot(NOTCH, 2.0 * np.hypot(patches.std[a], patches.std[b]))
+    std = np.hypot(patches.std[a], patches.std[b])
+    tolerance = np.hypot(NOTCH, 2.0 * std)
     vote = np.where(np.isfinite(notch), np.clip((tolerance - notch) / tolerance, -1.0, 1.0), 0.1)
     allowed = np.hypot(STEP, 2.0 * noise * np.maximum(own[a, 2], own[b, 2]) ** 2)
     vote = np.minimum(vote, np.clip((allowed - steps(patches, own, pairs)) / allowed, -1.0, 1.0))
-    return vote * (length - broken) - broken
+    # what is known badly says little: a patch across an edge
+    certain = NOTCH**2 / (NOTCH**2 + 4.0 * std**2)
+    return (vote * (length - broken) - broken) * certain, length * certain
 
 
 def partition(moments: Array, border: Labels, noise: float) -> tuple[NDArray[np.int32], Patches]:
@@ -154,7 +158,7 @@ def partition(moments: Array, border: Labels, noise: float) -> tuple[NDArray[np.
     broken = np.bincount(index.ravel(), weights=border[:, 2], minlength=len(pairs)).astype(np.float64)
     patches = planes(moments)
     own = patches.centre
-    root = group(count, pairs, votes(patches, own, pairs, length, broken, noise), length)
+    root = group(count, pairs, *votes(patches, own, pairs, length, broken, noise))
     for _ in range(_ROUNDS):
         a, b = pairs.T
         smooth = np.sum(patches.normal[a] * patches.normal[b], axis=1) > math.cos(SMOOTH)
@@ -163,7 +167,7 @@ def partition(moments: Array, border: Labels, noise: float) -> tuple[NDArray[np.
         np.add.at(wide, a[smooth], moments[b[smooth]])
         np.add.at(wide, b[smooth], moments[a[smooth]])
         patches = planes(wide)
-        root = group(count, pairs, votes(patches, own, pairs, length, broken, noise), length)
+        root = group(count, pairs, *votes(patches, own, pairs, length, broken, noise))
     return root, patches
 
 

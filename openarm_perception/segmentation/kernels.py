@@ -22,6 +22,8 @@ Real = float | np.float32
 
 #: A surface may be slanted so much (tangent) before a step between pixels is a break in depth.
 SLANT = 4.0
+#: Bend beyond that of the surface around that is an edge, deg.
+EDGE = 8.0
 #: Of levels by which patches grow.
 _LEVELS = 64
 
@@ -30,7 +32,7 @@ _LEVELS = 64
 def _together(z: float, other: float, distance: float, noise: Real) -> bool:
     """Return whether two depths, so far apart in the image (as a tangent), may be of one surface."""
     near = min(z, other)
-    return abs(z - other) <= SLANT * distance * near + 4.0 * noise * near * near
+    return bool(abs(z - other) <= SLANT * distance * near + 4.0 * noise * near * near)
 
 
 @njit(cache=True, nogil=True)
@@ -206,29 +208,60 @@ def grow_patches(strength: Bytes, broken: Bytes, wanted: Mask, size: int) -> Lab
     owner = np.empty(4 * h * w + 1, np.int32)
     first = np.full(_LEVELS, -1, np.int32)
     last = np.full(_LEVELS, -1, np.int32)
-    waiting = 0
-    count = 0
-    for seeds in range(2):
-        for cell_v in range(0, h, size):
-            for cell_u in range(0, w, size):
-                best, at = 1000, -1
-                for v in range(cell_v, min(cell_v + size, h)):
-                    for u in range(cell_u, min(cell_u + size, w)):
-                        if wanted[v, u] and label[v, u] == 0:
-                            # of equally flat ones the one nearest to the middle
-                            off = abs(v - cell_v - size // 2) + abs(u - cell_u - size // 2)
-                            worth = 8 * int(strength[v, u]) + off if seeds == 0 else off
-                            if worth < best:
-                                best, at = worth, v * w + u
-                if at < 0 or (seeds == 1 and label[at // w, at % w] != 0):
-                    continue
+    waiting = count = 0
+    for at in _seeds(strength, wanted, size):
+        count += 1
+        place[waiting], owner[waiting] = at, count
+        waiting = _wait(waiting, 0, following, first, last)
+    waiting = _flood(label, strength, broken, wanted, following, place, owner, first, last, waiting)
+    for v in range(h):
+        for u in range(w):
+            if wanted[v, u] and label[v, u] == 0:
                 count += 1
-                place[waiting], owner[waiting] = at, count
+                place[waiting], owner[waiting] = v * w + u, count
                 waiting = _wait(waiting, 0, following, first, last)
-                if seeds == 1:
-                    waiting = _flood(label, strength, broken, wanted, following, place, owner, first, last, waiting)
-        waiting = _flood(label, strength, broken, wanted, following, place, owner, first, last, waiting)
+                waiting = _flood(label, strength, broken, wanted, following, place, owner, first, last, waiting)
     return label
+
+
+@njit(cache=True, nogil=True)
+def _seeds(strength: Bytes, wanted: Mask, size: int) -> Labels:
+    """Return the flattest pixel of each cell, as row · width + column; none where the cells around are much flatter.
+
+    There runs an edge, and no patch may lie across it.
+    """
+    h, w = strength.shape
+    rows, columns = (h + size - 1) // size, (w + size - 1) // size
+    flattest = np.full((rows, columns), 255, np.int64)
+    at = np.full((rows, columns), -1, np.int64)
+    for j in range(rows):
+        for i in range(columns):
+            best = 100_000
+            for v in range(j * size, min(j * size + size, h)):
+                for u in range(i * size, min(i * size + size, w)):
+                    if wanted[v, u]:
+                        # of equally flat ones the one nearest to the middle
+                        off = abs(v - j * size - size // 2) + abs(u - i * size - size // 2)
+                        worth = 2 * size * int(strength[v, u]) + off
+                        if worth < best:
+                            best, at[j, i], flattest[j, i] = worth, v * w + u, strength[v, u]
+    out = np.empty(rows * columns, np.int32)
+    around = np.empty(9, np.int64)
+    n = 0
+    for j in range(rows):
+        for i in range(columns):
+            if at[j, i] < 0:
+                continue
+            k = 0
+            for y in range(max(j - 1, 0), min(j + 2, rows)):
+                for x in range(max(i - 1, 0), min(i + 2, columns)):
+                    if at[y, x] >= 0:
+                        around[k] = flattest[y, x]
+                        k += 1
+            if flattest[j, i] <= 1.5 * np.median(around[:k]) + EDGE:
+                out[n] = at[j, i]
+                n += 1
+    return out[:n]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -303,7 +336,7 @@ def patch_moments(points: Points, label: Labels, count: int) -> Array:
 
 @njit(cache=True, nogil=True)
 def borders(label: Labels, broken: Bytes) -> Labels:
-    """Return (n, 3) a row per pair of neighbours with different labels: both, smaller first, and whether depth breaks."""
+    """Return (n, 3) a row per pair of neighbours with different labels: both, smaller first; 1 where depth breaks."""
     h, w = label.shape
     out = np.empty((2 * h * w, 3), np.int32)
     n = 0
