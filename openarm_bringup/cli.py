@@ -45,7 +45,7 @@ COMMANDS = {
     "Grasp": ("pick:pick", "pick:order", f"{EVALUATION}.campaign:campaign"),
     "Inspect": ("processes:ps", "processes:logs", "doctor:doctor", "tf:tf", "hardware:hardware"),
     "Messages": ("ros2:topic", "ros2:service", "ros2:action", "ros2:node", "ros2:param"),
-    "Record and check": ("record:record", "record:replay", "record:check"),
+    "Record and check": ("perceive:perceive", "record:record", "record:replay", "record:check"),
     "Models and graphs": ("model:model", "graph:graph", "grasp:grasp", f"{EVALUATION}.detector:detector"),
     "Develop": ("checks:test", "checks:lint", f"{EVALUATION}.chaos:chaos", "checks:completion"),
 }

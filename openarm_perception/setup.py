@@ -9,7 +9,7 @@ setup(
     version="0.2.0",
     packages=[NAME, *(f"{NAME}.{part}" for part in find_packages("."))],
     package_dir={NAME: "."},
-    package_data={NAME: ["py.typed"]},
+    package_data={NAME: ["py.typed", "frames/*.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -51,35 +51,58 @@ def read_frame(color: Path, depth: Path, info: Path, depth_scale: float, limits:
         limits: Depths that count.
 
     Raises:
-        OpenArmError: BAD_IMAGE, for files that are no such images or do not fit together; INVALID_ARGUMENT, for a scale.
+        OpenArmError: BAD_IMAGE, for files that are no such images or do not belong together; INVALID_ARGUMENT, for a
+            scale.
+    """
+    rgb = _read_image(color)
+    if rgb.dtype != np.uint8 or rgb.ndim != 3:
+        raise _refused(color, f"has {_channels(rgb)}", "a colour image of 8 bits")
+    height, width = rgb.shape[:2]
+    lens = read_intrinsics(info, (width, height))
+    points = read_depth(depth, lens, depth_scale, limits)
+    return Frame(points, cv2.cvtColor(rgb[..., :3], cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False), lens)
+
+
+def read_depth(path: Path, lens: Intrinsics, depth_scale: float, limits: DepthLimits) -> Points:
+    """Read a depth image as organised points.
+
+    Args:
+        path: Image of 16 bits with one channel, 0 where nothing was measured.
+        lens: Intrinsics.
+        depth_scale: Metres of a count.
+        limits: Depths that count.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, for another image or another size; INVALID_ARGUMENT, for a scale.
     """
     if not 1e-6 <= depth_scale <= 1.0:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"depth scale is {depth_scale:g} m a count; expected 0.000001 .. 1, such as 0.001"
         )
-    rgb = _read_image(color)
-    if rgb.dtype != np.uint8 or rgb.ndim != 3:
-        raise _refused(color, f"has {_channels(rgb)}", "a colour image of 8 bits")
-    z = _read_image(depth)
+    z = _read_image(path)
     if z.dtype != np.uint16 or z.ndim != 2:
-        raise _refused(depth, f"has {_channels(z)}", "a depth image: one channel of 16 bits")
-    if rgb.shape[:2] != z.shape:
-        sizes = f"{rgb.shape[1]}x{rgb.shape[0]} and {z.shape[1]}x{z.shape[0]}"
-        raise OpenArmError(Code.BAD_IMAGE, f"{color} and {depth} are {sizes} pixels; expected images that are aligned")
-    lens = read_intrinsics(info, (z.shape[1], z.shape[0]))
+        raise _refused(path, f"has {_channels(z)}", "a depth image: one channel of 16 bits")
+    if z.shape != (lens.height, lens.width):
+        raise _refused(path, f"is {z.shape[1]}x{z.shape[0]} pixels", f"{lens.width}x{lens.height}, as the colour image")
     # as metres, whatever a count is
-    points = Deprojector(limits).organised(z.astype(np.float32) * np.float32(depth_scale), lens)
-    return Frame(points, cv2.cvtColor(rgb[..., :3], cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False), lens)
+    return Deprojector(limits).organised(z.astype(np.float32) * np.float32(depth_scale), lens)
 
 
-def read_cloud(path: Path) -> Frame:
+def read_cloud(path: Path, limits: DepthLimits) -> Frame:
     """Read a frame that is an organised cloud in a PCD file; the intrinsics are those that its points fit.
+
+    Args:
+        path: Of the file.
+        limits: Depths that count.
 
     Raises:
         OpenArmError: BAD_IMAGE, for what is no such file, or was not seen by a pinhole camera.
     """
     cloud = read_pcd(path)
-    return Frame(cloud.points, cloud.rgb, intrinsics_of(cloud.points))
+    lens = intrinsics_of(cloud.points)
+    z = cloud.points[..., 2]
+    cloud.points[~((z >= limits.near) & (z <= limits.far))] = np.nan
+    return Frame(cloud.points, cloud.rgb, lens)
 
 
 def intrinsics_of(points: Points) -> Intrinsics:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.types import Array, Bytes, Mask
 from openarm_perception.geometry.depth import Points
+from openarm_perception.segmentation.background import nearer, noise_between
 from openarm_perception.segmentation.divide import SegmentationConfig, divide
 from openarm_perception.segmentation.outline import Outline, survey
 from openarm_perception.segmentation.shape import Shape, judge
@@ -78,6 +79,7 @@ def segment(
     rgb: Bytes | None = None,
     T_base_camera: Array | None = None,
     robot: Mask | None = None,
+    background: Points | None = None,
 ) -> Segmentation:
     """Find what stands on the table in the organised cloud of one camera.
 
@@ -88,17 +90,21 @@ def segment(
         rgb: (h, w, 3) uint8 aligned with it: clusters have a colour then.
         T_base_camera: (4, 4) optical frame in the base frame, whose z points up; None: the support may be slanted.
         robot: (h, w) pixels that show the robot or what it holds.
+        background: (h, w, 3) as `points`, of the empty table or box; the support is found there, and what is no nearer
+            than it is no thing.
 
     Raises:
-        OpenArmError: NOTHING_DETECTED, when there is no plane that things may stand on.
+        OpenArmError: BAD_IMAGE, for a background of another place; NOTHING_DETECTED, when there is no plane that things
+            may stand on.
     """
     robot = np.zeros(points.shape[:2], np.bool_) if robot is None else robot
-    seen = points
-    if robot.any():
-        seen = points.copy()
-        seen[robot] = np.nan
+    seen = np.where(robot[..., None], np.float32(np.nan), points) if background is None else background
     support = find_support(seen, None if T_base_camera is None else T_base_camera[2, :3])
-    divided = divide(points, intrinsics, support, config, robot)
+    apart = robot
+    if background is not None:
+        support = replace(support, noise=noise_between(points, background, support.noise))
+        apart = robot | ~nearer(points, background, support.noise, config.sigmas, config.least_height)
+    divided = divide(points, intrinsics, support, config, apart, rgb)
     outlines = survey(divided.label, points, robot, support.noise)
     pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
     T_plane_camera = se3.make(np.stack([*support.axes.T, support.normal]), (0.0, 0.0, support.offset))

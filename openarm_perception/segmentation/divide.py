@@ -14,8 +14,9 @@ from pydantic import Field
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.flying_pixels import label_lonely
 from openarm_common.config import Config
-from openarm_common.types import Array, Mask
+from openarm_common.types import Array, Bytes, Mask
 from openarm_perception.geometry.depth import Points
+from openarm_perception.segmentation.colors import join_alike
 from openarm_perception.segmentation.grouping import partition
 from openarm_perception.segmentation.kernels import (
     SLANT,
@@ -52,6 +53,7 @@ class SegmentationConfig(Config):
     least_size: float = Field(
         default=0.012, gt=0.0, le=0.2, description="pieces that are smaller (root of the area) are no things, m"
     )
+    join_colors: bool = Field(default=True, description="parts that touch and have the same plain colour are one thing")
     least_pixels: int = Field(default=60, ge=12, description="nor are pieces of fewer pixels")
 
 
@@ -71,7 +73,12 @@ class Divided:
 
 
 def divide(
-    points: Points, intrinsics: Intrinsics, support: Support, config: SegmentationConfig, robot: Mask
+    points: Points,
+    intrinsics: Intrinsics,
+    support: Support,
+    config: SegmentationConfig,
+    apart: Mask,
+    rgb: Bytes | None = None,
 ) -> Divided:
     """Divide what rises above the support among things.
 
@@ -80,13 +87,14 @@ def divide(
         intrinsics: Of the camera.
         support: What things stand on.
         config: What counts as a thing.
-        robot: (h, w) pixels that show the robot or what it holds.
+        apart: (h, w) pixels of no thing, such as those of the robot.
+        rgb: (h, w, 3) uint8; None: parts of one colour are not joined.
     """
     pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
     noise = np.float32(support.noise)
     z = points[..., 2]
     heights = support.heights(points)
-    wanted = _above(points, heights, support, config) & ~_flying(z, pixel, support.noise) & ~robot
+    wanted = _above(points, heights, support, config) & ~_flying(z, pixel, support.noise) & ~apart
     size = _patch_size(z[wanted], pixel, support.noise, config)
     broken = breaks(points, wanted, pixel, noise)
     strength = edge_strength(masked_normals(points, wanted, max(2, size // 2), noise), wanted, max(2, size // 2))
@@ -97,6 +105,8 @@ def divide(
     border = borders(patch, broken)
     root, _ = partition(moments, border, support.noise)
     root = _join_small(root, patch, area, moments[:, 0], border, size, config)
+    if rgb is not None and config.join_colors:
+        root = join_alike(root, patch, border, rgb)
     number = _number(root, area, moments, support, config)
     return Divided(number[patch], patch, heights)
 

@@ -22,7 +22,7 @@ from openarm_perception.segmentation.kernels import local_normals
 
 #: Noise at 1 m, m, that is assumed first, and the range within which it is measured: from industrial structured light
 #: to the first consumer sensors.
-FIRST_NOISE, _LEAST_NOISE, _MOST_NOISE = 0.003, 0.0004, 0.008
+FIRST_NOISE, LEAST_NOISE, _MOST_NOISE = 0.003, 0.0004, 0.008
 #: Points on a grid of the image that are looked at, hypotheses, and points that choose among them.
 _SAMPLES, _TRIES, _VOTERS = 20_000, 256, 2000
 #: A support has this share of the points that were measured at least.
@@ -110,7 +110,7 @@ def find_support(points: Points, up: Array | None = None) -> Support:
         normal = -normal if normal @ middle > 0.0 else normal
         off = np.abs((used - middle) @ normal) / (used[:, 2] ** 2 * facing[on])
         # a standard deviation of what is left within the band; 1.55 makes up for its tails
-        noise = float(np.clip(1.55 * np.median(off), _LEAST_NOISE, _MOST_NOISE))
+        noise = float(np.clip(1.55 * np.median(off), LEAST_NOISE, _MOST_NOISE))
     axes = np.linalg.svd(normal[None])[2][1:].T
     if np.linalg.det(np.column_stack([axes, normal])) < 0.0:
         axes = axes[:, ::-1].copy()

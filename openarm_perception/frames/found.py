@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is found in a recorded frame: table, pictures, page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from openarm_common.figures import data_uri, render_page
+from openarm_common.types import Array
+from openarm_perception.detection.detector import ColorDetector, Detection2D
+from openarm_perception.frames.images import Frame
+from openarm_perception.geometry.depth import Points
+from openarm_perception.segmentation.clusters import Cluster, Segmentation, segment
+from openarm_perception.segmentation.draw import depth_picture, label_picture, overlay
+
+#: A thing has a colour when so many of its pixels have it.
+_COLORED = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A frame and what was found in it.
+
+    Attributes:
+        frame: The frame.
+        segmentation: Things in depth.
+        detections: Things in colour.
+        colors: Name of the colour of each cluster; empty where it has none of the palette.
+        placed: Whether the pose of the camera is known: points are in the base frame then, else in the optical one.
+    """
+
+    frame: Frame
+    segmentation: Segmentation
+    detections: tuple[Detection2D, ...]
+    colors: tuple[str, ...]
+    placed: bool
+
+    def cluster_of(self, found: Detection2D) -> int:
+        """Return the number of the cluster that has most pixels of a detection; 0: none has half of them."""
+        (u, v), (w, h) = found.origin, found.size
+        inside = self.segmentation.label[v : v + h, u : u + w][found.mask]
+        count = np.bincount(inside, minlength=1)
+        best = int(count.argmax())
+        return best if 2 * count[best] >= len(inside) else 0
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what was found; m, pixels, degrees of the colour wheel as names."""
+        support = self.segmentation.support
+        lens = self.frame.intrinsics
+        return {
+            "frame": "base" if self.placed else "camera",
+            "intrinsics": {name: round(float(getattr(lens, name)), 3) for name in ("fx", "fy", "cx", "cy")},
+            "support": {
+                "normal": [round(float(v), 5) for v in support.normal], "offset": round(support.offset, 5),
+                "noise_at_1m": round(support.noise, 6), "share": round(support.share, 4),
+            },
+            "clusters": [
+                self._cluster(one, color) for one, color in zip(self.segmentation.clusters, self.colors, strict=True)
+            ],
+            "detections": [
+                {
+                    "label": one.label, "score": round(one.score, 4), "centre": list(one.centre),
+                    "size": list(one.size), "cluster": self.cluster_of(one),
+                }
+                for one in self.detections
+            ],
+        }  # fmt: skip
+
+    @staticmethod
+    def _cluster(one: Cluster, color: str) -> dict[str, Any]:
+        return {
+            "id": one.id, "pixels": one.pixels, "centre": [round(float(v), 5) for v in one.T_frame_box[:3, 3]],
+            "size": [round(float(v), 5) for v in one.size], "shape": one.shape.kind, "why": one.shape.why,
+            "color": color, "rgb": None if one.color is None else list(one.color),
+            "cut": one.outline.cut, "outline": {name: round(v, 4) for name, v in vars(one.outline).items()},
+        }  # fmt: skip
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return a row of text for each cluster: number, colour, shape, edges, place, pixels, remarks."""
+        out: list[tuple[str, ...]] = []
+        for one, color in zip(self.segmentation.clusters, self.colors, strict=True):
+            edges = " x ".join(f"{edge * 1e3:.0f}" for edge in one.size)
+            place = " ".join(f"{v:+.3f}" for v in one.T_frame_box[:3, 3])
+            out.append((str(one.id), color, one.shape.kind, edges, place, str(one.pixels), one.shape.why))
+        return out
+
+    def write(self, folder: Path) -> tuple[Path, ...]:
+        """Write pictures, the label image (16 bits, PNG) and a page into a folder; return their paths."""
+        label = self.segmentation.label
+        rgb = self.frame.rgb
+        z = self.frame.points[..., 2]
+        depth = depth_picture(z)
+        pictures = {
+            "overlay": overlay(depth if rgb is None else rgb, label, numbers=True),
+            "labels": label_picture(label),
+            "depth": depth,
+        }
+        if rgb is not None:
+            pictures["color"] = rgb
+        files = {f"{name}.png": _png(picture[..., ::-1]) for name, picture in pictures.items()}
+        page = render_page(
+            Path(__file__).with_name("found.html"),
+            rows=self.rows(),
+            detections=[(one.label, f"{one.score:.2f}", self.cluster_of(one) or "") for one in self.detections],
+            support=self.segmentation.support,
+            frame="base frame" if self.placed else "optical frame of the camera",
+            pictures={name: data_uri(files[f"{name}.png"], "image/png") for name in pictures},
+        )
+        files["label.png"] = _png(label)
+        files["index.html"] = page.encode()
+        for name, data in files.items():
+            (folder / name).write_bytes(data)
+        return tuple(folder / name for name in files)
+
+
+def find(
+    frame: Frame, colors: ColorDetector, T_base_camera: Array | None = None, background: Points | None = None
+) -> Found:
+    """Segment a frame, and detect what has a colour of the palette.
+
+    Args:
+        frame: The frame.
+        colors: Finds and names colours.
+        T_base_camera: (4, 4) optical frame in a frame whose z points up; None: not known.
+        background: (h, w, 3) points of the empty scene; None: not known.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED, when there is no plane that things may stand on; BAD_IMAGE, for a background of
+            another size.
+    """
+    result = segment(frame.points, frame.intrinsics, rgb=frame.rgb, T_base_camera=T_base_camera, background=background)
+    rgb = frame.rgb
+    if rgb is None:
+        return Found(frame, result, (), ("",) * len(result.clusters), T_base_camera is not None)
+    named = [colors.name(np.ascontiguousarray(rgb[one.window]), one.mask) for one in result.clusters]
+    names = tuple(name if share >= _COLORED else "" for name, share in named)
+    return Found(frame, result, colors.detect(rgb), names, T_base_camera is not None)
+
+
+def _png(picture: Any) -> bytes:
+    done, data = cv2.imencode(".png", np.ascontiguousarray(picture))
+    assert done
+    return bytes(data)
