@@ -36,6 +36,8 @@ _OVER = 0.5
 _ASKED = 200
 #: Of its border with a larger thing, so much without a break in depth makes a small piece part of it.
 _GROWN_ON = 0.3
+#: Of the outline of a strip, so much along a larger thing makes it part of that, whether depth breaks or not.
+_ALONG = 0.25
 
 
 class SegmentationConfig(Config):
@@ -150,7 +152,9 @@ def _join_small(
         extent = np.bincount(root, weights=area, minlength=len(root))
         count = np.bincount(root, weights=pixels, minlength=len(root))
         small = (extent < config.least_size**2) | (count < config.least_pixels)
-        small |= _half_width(root[patch], len(root)) < 0.5 * size
+        half_width = _half_width(root[patch], len(root))
+        thin = half_width < 0.5 * size
+        small |= thin
         a, b = root[border[:, 0]], root[border[:, 1]]
         a, b = np.concatenate([a, b]), np.concatenate([b, a])
         between = small[a] & (a != b) & (extent[b] > extent[a])
@@ -162,7 +166,9 @@ def _join_small(
         length = np.bincount(index.ravel())
         to = np.arange(len(root))
         for i in np.argsort(whole, kind="stable"):  # the longest last
-            if whole[i] >= _GROWN_ON * length[i]:
+            # a strip along a thing, such as a side that is seen edge on: its outline is its pixels over half its width
+            along = thin[pairs[0, i]] and length[i] * half_width[pairs[0, i]] >= _ALONG * count[pairs[0, i]]
+            if along or whole[i] >= _GROWN_ON * length[i]:
                 to[pairs[0, i]] = pairs[1, i]
         root = to[root].astype(np.int32)
     return root

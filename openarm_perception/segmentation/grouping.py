@@ -23,6 +23,8 @@ from openarm_perception.segmentation.kernels import Labels
 NOTCH = math.radians(10.0)
 #: And a step as high as this, or twice the noise: the least height of a thing, m.
 STEP = 0.004
+#: A few votes for a border make it less sure than many do, by so many that say nothing.
+_DOUBT = 5.0
 #: Pixels of a patch from which its plane is known.
 _FEW = 8
 #: Patches of one surface are within this of each other, rad; those of two faces of a box are not.
@@ -115,6 +117,27 @@ def steps(patches: Patches, own: Array, pairs: Labels) -> Array:
     return np.where(parallel, step, 0.0)
 
 
+def singular(patches: Patches, own: Array, pairs: Labels) -> Array:
+    """Return which pairs (n,) of patches lie along the line where their planes meet, 0 or 1.
+
+    They touch at a corner only, and whether they meet convexly is not seen there (the sanity criterion of LCCP).
+
+    Args:
+        patches: Their planes.
+        own: (m, 3) centres of the patches themselves, m.
+        pairs: (n, 2).
+    """
+    a, b = pairs.T
+    crease = np.cross(patches.normal[a], patches.normal[b])
+    sine = np.linalg.norm(crease, axis=1)
+    along = own[a] - own[b]
+    length = np.linalg.norm(along, axis=1) * sine
+    cosine = np.abs(np.sum(crease * along, axis=1)) / np.maximum(length, 1e-12)
+    between = np.degrees(np.arccos(np.clip(np.sum(patches.normal[a] * patches.normal[b], axis=1), -1.0, 1.0)))
+    least = 60.0 / (1.0 + np.exp(-0.25 * (between - 25.0)))
+    return (np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0))) < least).astype(np.float64)
+
+
 def votes(
     patches: Patches, own: Array, pairs: Labels, length: Array, broken: Array, noise: float
 ) -> tuple[Array, Array]:
@@ -137,7 +160,7 @@ def votes(
     allowed = np.hypot(STEP, 2.0 * noise * np.maximum(own[a, 2], own[b, 2]) ** 2)
     vote = np.minimum(vote, np.clip((allowed - steps(patches, own, pairs)) / allowed, -1.0, 1.0))
     # what is known badly says little: a patch across an edge
-    certain = NOTCH**2 / (NOTCH**2 + 4.0 * std**2)
+    certain = NOTCH**2 / (NOTCH**2 + 4.0 * std**2) * (1.0 - 0.9 * singular(patches, own, pairs))
     return (vote * (length - broken) - broken) * certain, length * certain
 
 
@@ -188,13 +211,13 @@ def group(count: int, pairs: Labels, weight: Array, length: Array) -> NDArray[np
     for (a, b), w, n in zip(pairs.tolist(), weight.tolist(), length.tolist(), strict=True):
         around[a][b] = around[b][a] = (w, n)
         if w > 0.0:
-            waiting.append((-w / n, a, b))
+            waiting.append((-w / (n + _DOUBT), a, b))
     heapq.heapify(waiting)
     parent = list(range(count))
     while waiting:
         key, a, b = heapq.heappop(waiting)
         found = around[a].get(b) if parent[a] == a and parent[b] == b else None
-        if found is None or -found[0] / found[1] != key:
+        if found is None or -found[0] / (found[1] + _DOUBT) != key:
             continue  # joined since, or its border has changed
         if len(around[a]) < len(around[b]):
             a, b = b, a
@@ -208,7 +231,7 @@ def group(count: int, pairs: Labels, weight: Array, length: Array) -> NDArray[np
             joined = (before[0] + w, before[1] + n)
             around[a][other] = around[other][a] = joined
             if joined[0] > 0.0:
-                heapq.heappush(waiting, (-joined[0] / joined[1], min(a, other), max(a, other)))
+                heapq.heappush(waiting, (-joined[0] / (joined[1] + _DOUBT), min(a, other), max(a, other)))
         around[b] = {}
     root = np.arange(count, dtype=np.int32)
     for i in range(count):
