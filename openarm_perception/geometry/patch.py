@@ -65,7 +65,7 @@ def cut(found: Detection2D, view: View, limits: DepthLimits, top_band: float) ->
     v0, v1 = max(v - _MARGIN, 0), min(v + h + _MARGIN, intrinsics.height)
     z = view.depth[v0:v1, u0:u1] * scale
     z = np.where((z >= limits.near) & (z <= limits.far), z, np.nan)
-    z, noise = _denoise(z)
+    z, noise = denoise(z)
     x = (np.arange(u0, u1) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(v0, v1) - intrinsics.cy) / intrinsics.fy
     in_camera = np.stack([*np.meshgrid(x, y), np.ones(z.shape)], axis=-1)
@@ -78,7 +78,7 @@ def cut(found: Detection2D, view: View, limits: DepthLimits, top_band: float) ->
     return Patch(found, intrinsics, T_base_camera, rays, z, points, coloured, hidden, band)
 
 
-def _denoise(z: Array) -> tuple[Array, float]:
+def denoise(z: Array) -> tuple[Array, float]:
     """Depth without the noise and dropouts of a real sensor, and the noise that is left, m; clean depth stays."""
     holes = np.isnan(z)
     # the median keeps edges where they are; a hole counts as far away, as what lies behind the object

@@ -18,6 +18,9 @@ from openarm_perception.segmentation.outline import Outline, survey
 from openarm_perception.segmentation.shape import Shape, judge
 from openarm_perception.segmentation.support import Support, find_support
 
+#: Pixels around a thing that are looked at for its edges.
+_MARGIN = 4
+
 
 @dataclass(frozen=True, eq=False)
 class Cluster:
@@ -115,9 +118,13 @@ def segment(
         window = _window(divided.label, i)
         mask = divided.label[window] == i
         local = points[window]
-        flat, rays = _in_plane(local, intrinsics, window, T_plane_camera)
-        z = float(np.median(local[..., 2][mask]))
-        shape = judge(mask, flat, rays, support.offset, outline.cut, pixel * z, support.noise * z * z)
+        z = local[..., 2]
+        other = ((divided.label[window] != 0) & ~mask) | robot[window]
+        depth = float(np.median(z[mask]))
+        shape = judge(
+            mask, other, z, _rays(intrinsics, window, T_plane_camera), support.offset, outline.cut, pixel * depth,
+            support.noise * depth * depth,
+        )  # fmt: skip
         T_plane_box = se3.make(se3.rot_z(shape.footprint.yaw), (*shape.footprint.centre, shape.height / 2.0))
         color = None
         if rgb is not None:
@@ -132,21 +139,19 @@ def segment(
 
 
 def _window(label: NDArray[np.uint16], i: int) -> tuple[slice, slice]:
-    """Return rows and columns around a thing, with one pixel more on each side where the image has one."""
+    """Return rows and columns around a thing, with a few pixels more on each side where the image has them."""
     on = label == i
     rows, columns = np.nonzero(on.any(axis=1))[0], np.nonzero(on.any(axis=0))[0]
-    top, left = max(int(rows[0]) - 1, 0), max(int(columns[0]) - 1, 0)
-    return slice(top, int(rows[-1]) + 2), slice(left, int(columns[-1]) + 2)
+    top, left = max(int(rows[0]) - _MARGIN, 0), max(int(columns[0]) - _MARGIN, 0)
+    height, width = label.shape
+    bottom, right = min(int(rows[-1]) + 1 + _MARGIN, height), min(int(columns[-1]) + 1 + _MARGIN, width)
+    return slice(top, bottom), slice(left, right)
 
 
-def _in_plane(
-    points: Points, intrinsics: Intrinsics, window: tuple[slice, slice], T_plane_camera: Array
-) -> tuple[Points, Points]:
-    """Return points (h, w, 3) of a window under the camera's foot on the plane, and the rays of its pixels, there."""
-    R = T_plane_camera[:3, :3].astype(np.float32)
+def _rays(intrinsics: Intrinsics, window: tuple[slice, slice], T_plane_camera: Array) -> Array:
+    """Return the directions (h, w, 3) of unit depth of the pixels of a window, in the axes of the plane."""
     x, y = intrinsics.rays
-    height, width = points.shape[:2]
-    rays = np.ones((height, width, 3), np.float32)
-    rays[..., 0] = x[window[1]][:width]
-    rays[..., 1] = y[window[0]][:height, None]
-    return points @ R.T + T_plane_camera[:3, 3].astype(np.float32), rays @ R.T
+    x, y = x[window[1]], y[window[0]]
+    rays = np.ones((len(y), len(x), 3))
+    rays[..., 0], rays[..., 1] = x, y[:, None]
+    return rays @ T_plane_camera[:3, :3].T

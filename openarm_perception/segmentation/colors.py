@@ -17,8 +17,8 @@ from openarm_perception.segmentation.kernels import Labels
 _ALIKE, _GREY = 0.03, 0.06
 #: A group has one colour when so many of its pixels are alike; darker pixels (sum of three) have none.
 _PLAIN, _DARK = 0.8, 60
-#: They have a common border without a break in depth, so long in roots of the area of the smaller.
-_COMMON = 0.3
+#: They have a common border, so long in roots of the area of the smaller, where depth steps by no more than this, mm.
+_COMMON, _STEP = 0.3, 30
 
 
 def join_alike(root: Labels, patch: Labels, border: Labels, rgb: Bytes) -> NDArray[np.int32]:
@@ -45,7 +45,7 @@ def join_alike(root: Labels, patch: Labels, border: Labels, rgb: Bytes) -> NDArr
     if not between.any():
         return root
     pairs, index = np.unique(np.sort(np.stack([a[between], b[between]]), axis=0), axis=1, return_inverse=True)
-    whole = np.bincount(index.ravel(), weights=1.0 - border[between, 2])
+    whole = np.bincount(index.ravel(), weights=border[between, 2] <= _STEP)
     for k in np.argsort(-whole, kind="stable"):
         first, second = (int(i) for i in pairs[:, k])
         mine, other = color[first], color[second]

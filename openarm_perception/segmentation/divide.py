@@ -38,6 +38,8 @@ _ASKED = 200
 _GROWN_ON = 0.3
 #: Of the outline of a strip, so much along a larger thing makes it part of that, whether depth breaks or not.
 _ALONG = 0.25
+#: What is nowhere wider than a pixel is the edge of something.
+_NARROW = 1.0
 
 
 class SegmentationConfig(Config):
@@ -104,12 +106,12 @@ def divide(
     moments = patch_moments(points, patch, int(patch.max()) + 1)
     # metres across of a pixel at a patch, squared
     area = moments[:, 0] * (pixel * moments[:, 3] / np.maximum(moments[:, 0], 1.0)) ** 2
-    border = borders(patch, broken)
+    border = borders(patch, broken, points)
     root, _ = partition(moments, border, support.noise)
     root = _join_small(root, patch, area, moments[:, 0], border, size, config)
     if rgb is not None and config.join_colors:
         root = join_alike(root, patch, border, rgb)
-    number = _number(root, area, moments, support, config)
+    number = _number(root, patch, area, moments, support, config)
     return Divided(number[patch], patch, heights)
 
 
@@ -161,7 +163,7 @@ def _join_small(
         if not between.any():
             break
         pairs, index = np.unique(np.stack([a[between], b[between]]), axis=1, return_inverse=True)
-        broken = np.tile(border[:, 2], 2)[between]
+        broken = np.tile(border[:, 2] > 0, 2)[between]
         whole = np.bincount(index.ravel(), weights=1.0 - broken)
         length = np.bincount(index.ravel())
         to = np.arange(len(root))
@@ -186,16 +188,17 @@ def _half_width(label: NDArray[np.int32], count: int) -> Array:
 
 
 def _number(
-    root: Labels, area: Array, moments: Array, support: Support, config: SegmentationConfig
+    root: Labels, patch: Labels, area: Array, moments: Array, support: Support, config: SegmentationConfig
 ) -> NDArray[np.uint16]:
     """Return the numbers (n,) of the things that patches belong to, the largest first; 0 of what is none."""
     size = np.bincount(root, weights=area, minlength=len(root))
     count = np.bincount(root, weights=moments[:, 0], minlength=len(root))
+    half_width = _half_width(root[patch], len(root))
     number = np.zeros(len(root), np.uint16)
     centre = moments[:, 1:4] / np.maximum(moments[:, :1], 1.0)
     n = 0
     for i in np.argsort(-size, kind="stable"):
-        if size[i] < config.least_size**2 or count[i] < config.least_pixels:
+        if size[i] < config.least_size**2 or count[i] < config.least_pixels or half_width[i] < _NARROW:
             continue
         members = np.nonzero((root == i) & (moments[:, 0] > 0.0))[0]
         if support.share_over(centre[members[:: max(1, len(members) // _ASKED)]]) < _OVER:

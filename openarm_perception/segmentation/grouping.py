@@ -178,7 +178,7 @@ def partition(moments: Array, border: Labels, noise: float) -> tuple[NDArray[np.
     count = len(moments)
     pairs, index = np.unique(border[:, :2], axis=0, return_inverse=True)
     length = np.bincount(index.ravel(), minlength=len(pairs)).astype(np.float64)
-    broken = np.bincount(index.ravel(), weights=border[:, 2], minlength=len(pairs)).astype(np.float64)
+    broken = np.bincount(index.ravel(), weights=border[:, 2] > 0, minlength=len(pairs)).astype(np.float64)
     patches = planes(moments)
     own = patches.centre
     root = group(count, pairs, *votes(patches, own, pairs, length, broken, noise))

@@ -335,8 +335,8 @@ def patch_moments(points: Points, label: Labels, count: int) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def borders(label: Labels, broken: Bytes) -> Labels:
-    """Return (n, 3) a row per pair of neighbours with different labels: both, smaller first; 1 where depth breaks."""
+def borders(label: Labels, broken: Bytes, points: Points) -> Labels:
+    """Return (n, 3) a row per pair of neighbours with other labels: both, smaller first; break in depth, mm, or 0."""
     h, w = label.shape
     out = np.empty((2 * h * w, 3), np.int32)
     n = 0
@@ -353,6 +353,9 @@ def borders(label: Labels, broken: Bytes) -> Labels:
                 if b == 0 or b == a:
                     continue
                 out[n, 0], out[n, 1] = min(a, b), max(a, b)
-                out[n, 2] = 1 if broken[v, u] & (1 << side) else 0
+                if broken[v, u] & (1 << side):
+                    out[n, 2] = max(1, int(1000.0 * abs(points[v, u, 2] - points[j, i, 2])))
+                else:
+                    out[n, 2] = 0
                 n += 1
     return out[:n].copy()

@@ -9,19 +9,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from openarm_common.errors import OpenArmError
 from openarm_common.types import Array, Mask
 from openarm_perception.geometry import footprint
-from openarm_perception.geometry.depth import Points
 from openarm_perception.geometry.footprint import Footprint
+from openarm_perception.geometry.patch import denoise
 
-#: What lies within this of the top is top, m, or within twice the noise.
+#: What lies within this of the top is top, m, or within three times the noise that is left.
 _BAND = 0.003
-#: An outline farther from its shape (rms) is no prism's, m; the noise of an edge comes to it.
+#: An outline farther from its shape (rms) is no prism's, m; half a pixel comes to it.
 _RMS = 0.0025
-#: So much of what is seen lies on a prism, within that distance of it, m, and three times the noise.
+#: A neighbour below the top within this is on a side, m.
+_SIDE_STEP = 0.015
+#: Pixels of a thing, without which its depth is not smoothed.
+_FEW = 30
+#: So much of what is seen lies on a prism, within that distance of it, m, the noise and a pixel.
 _SHARE, _NEAR = 0.9, 0.004
 
 
@@ -45,51 +51,70 @@ class Shape:
         return {"rectangle": "box", "circle": "cylinder"}.get(self.footprint.kind, "unknown")
 
 
-def judge(mask: Mask, flat: Points, rays: Points, eye: float, hidden: str, pixel: float, noise: float) -> Shape:
+def judge(
+    mask: Mask, other: Mask, z: NDArray[np.float32], rays: Array, eye: float, hidden: str, pixel: float, noise: float
+) -> Shape:
     """Fit a prism to a thing.
 
     Args:
-        mask: (h, w) its pixels in a window of the image, which has one pixel more on each side where the image has.
-        flat: (h, w, 3) the points of the window: two coordinates along the plane, and the height over it, m.
-        rays: (h, w, 3) directions of the pixels, in the same axes; the camera is at (0, 0).
+        mask: (h, w) its pixels in a window of the image, with some pixels more on each side where the image has them.
+        other: (h, w) pixels of other things and of the robot.
+        z: (h, w) depth of the window, m.
+        rays: (h, w, 3) directions of unit depth of the pixels: two along the plane, and up; the camera is at (0, 0).
         eye: Height of the camera over the plane, m.
         hidden: What cuts its outline; a prism is not fitted to what is seen in part.
         pixel: Distance of neighbouring pixels at its depth, m.
         noise: Standard deviation of a depth there, m.
     """
-    points = flat[mask].astype(np.float64)
-    heights = points[:, 2]
-    band = max(_BAND, 2.0 * noise)
-    near_top = np.quantile(heights, 0.95, method="lower")
-    top = float(np.median(heights[np.abs(heights - near_top) <= band]))
-    around = footprint.bound(points[:, :2], pixel)
+    smooth, left = denoise(z.astype(np.float64))
+    flat: Array = rays * smooth[..., None] + (0.0, 0.0, eye)
+    solid = mask & np.isfinite(smooth)
+    if np.count_nonzero(solid) < _FEW:
+        flat, solid = rays * z[..., None].astype(np.float64) + (0.0, 0.0, eye), mask
+    points = flat[solid]
+    band = max(_BAND, 3.0 * left)
+    near_top = np.quantile(points[:, 2], 0.95, method="lower")
+    top = float(np.median(points[np.abs(points[:, 2] - near_top) <= band, 2]))
+    # the pixels of its border lie anywhere between it and what is behind
+    inner = cv2.erode(solid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    whole = np.count_nonzero(inner) > 0.5 * np.count_nonzero(solid)
+    around = footprint.bound(flat[inner][:, :2] if whole else points[:, :2], (3.0 if whole else 1.0) * pixel)
     if hidden:
         return Shape(around, top, f"its outline is cut by {hidden}")
-    face = mask & (np.abs(flat[..., 2] - top) <= band)
     try:
-        shape = footprint.fit(_edges(face, rays, top - eye), pixel)
+        shape = footprint.fit(_edges(flat, solid, other, rays, top, eye, band), pixel)
     except OpenArmError:
         return Shape(around, top, "its top is neither rectangular nor round")
-    if shape.rms > np.hypot(_RMS, pixel):
+    if shape.rms > np.hypot(_RMS, 0.5 * pixel):
         return Shape(around, top, f"the outline of its top is {shape.rms * 1e3:.1f} mm (rms) from the nearest prism's")
-    share = _on_prism(points, shape, top, max(_NEAR, band) + 3.0 * noise + pixel)
+    share = _on_prism(flat[inner] if whole else points, shape, top, max(_NEAR, band) + noise + pixel)
     if share < _SHARE:
         return Shape(around, top, f"{1.0 - share:.0%} of what is seen lies on no prism with its top")
     return Shape(shape, top, "")
 
 
-def _edges(face: Mask, rays: Points, below: float) -> Array:
-    """Return points (n, 2) on the edges of a face: rays between its pixels and those beyond, so far over the camera."""
+def _edges(flat: Array, solid: Mask, other: Mask, rays: Array, top: float, eye: float, band: float) -> Array:
+    """Return points (n, 2) on the edges of the top, m: rays between its pixels and those beyond, at its height."""
+    grown = cv2.dilate(solid.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    level = grown & ~other & (np.abs(flat[..., 2] - top) <= band)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
+    if count < 2:
+        return np.empty((0, 2))
+    face = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
     h, w = face.shape
     found: list[Array] = []
     v, u = np.nonzero(face)
     for dv, du in ((0, -1), (0, 1), (-1, 0), (1, 0)):
         j, i = v + dv, u + du
-        inside = (j >= 0) & (j < h) & (i >= 0) & (i < w)
-        edge = inside.copy()
-        edge[inside] = ~face[j[inside], i[inside]]
-        ray = 0.5 * (rays[v[edge], u[edge]] + rays[j[edge], i[edge]]).astype(np.float64)
-        found.append(ray[:, :2] * below / ray[:, 2:])
+        edge = (j >= 0) & (j < h) & (i >= 0) & (i < w)
+        edge[edge] = ~face[j[edge], i[edge]]
+        near, far = (v[edge], u[edge]), (j[edge], i[edge])
+        ray = 0.5 * (rays[near] + rays[far])
+        # down a side the face goes on as far as heights count as top
+        apart = np.linalg.norm(flat[far] - flat[near], axis=1)
+        side = solid[far] & (apart <= _SIDE_STEP) & (flat[far][:, 2] < top)
+        height = np.where(side, top - band, top)
+        found.append(ray[:, :2] * ((height - eye) / ray[:, 2])[:, None])
     return np.concatenate(found)
 
 

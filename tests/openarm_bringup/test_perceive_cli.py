@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm perceive`: a recorded frame, what is printed and written, what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from openarm_bringup import cli
+from openarm_common.camera.cameras import Intrinsics
+from openarm_perception.frames.pcd import OrganisedCloud, read_pcd, write_pcd
+from openarm_perception.geometry.depth import Deprojector, DepthLimits
+
+LENS = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
+#: Camera 0.7 m over the table, looking straight down; a red box of 80 x 60 x 50 mm.
+DISTANCE, HALF, HEIGHT = 0.7, (0.04, 0.03), 0.05
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[str, ...]:
+    """Colour, depth in 0.1 mm, intrinsics."""
+    v, u = np.mgrid[:120, :160]
+    x, y = (u - LENS.cx) / LENS.fx * (DISTANCE - HEIGHT), (v - LENS.cy) / LENS.fy * (DISTANCE - HEIGHT)
+    on = (np.abs(x) < HALF[0]) & (np.abs(y) < HALF[1])
+    z = np.where(on, DISTANCE - HEIGHT, DISTANCE)
+    color = np.full((120, 160, 3), 180, np.uint8)
+    color[on] = (20, 20, 210)
+    cv2.imwrite(str(tmp_path / "c.png"), color)
+    cv2.imwrite(str(tmp_path / "z.png"), np.round(z * 1e4).astype(np.uint16))
+    (tmp_path / "k.yaml").write_text(f"fx: {LENS.fx}\nfy: {LENS.fy}\ncx: {LENS.cx}\ncy: {LENS.cy}\n")
+    points = Deprojector(DepthLimits()).organised(z.astype(np.float32), LENS)
+    write_pcd(tmp_path / "a.pcd", OrganisedCloud(points, np.ascontiguousarray(color[..., ::-1]), None))
+    return str(tmp_path / "c.png"), str(tmp_path / "z.png"), "--info", str(tmp_path / "k.yaml")
+
+
+def call(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict[str, object]]:
+    code = cli.run(["perceive", *argv, "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_a_box_is_found_measured_and_drawn(files, tmp_path, capsys):
+    out = tmp_path / "a" / "out"
+    code, answer = call(capsys, *files, "--depth-scale", "0.0001", "--out", str(out))
+    assert (code, answer["success"], answer["frame"]) == (0, True, "camera")
+    (one,) = answer["clusters"]  # type: ignore[misc]
+    assert (one["shape"], one["color"], one["cut"]) == ("box", "red", "")
+    assert one["size"] == pytest.approx([0.06, 0.08, 0.05], abs=0.005)  # a pixel
+    assert one["centre"] == pytest.approx([0.0, 0.0, DISTANCE - HEIGHT / 2], abs=0.003)
+    (detection,) = answer["detections"]  # type: ignore[misc]
+    assert (detection["label"], detection["cluster"]) == ("red", 1)
+    names = ("overlay.png", "labels.png", "label.png", "depth.png", "color.png", "index.html")
+    assert sorted(Path(path).name for path in answer["written"]) == sorted(names)  # type: ignore[union-attr]
+    label = cv2.imread(str(out / "label.png"), cv2.IMREAD_UNCHANGED)
+    assert label.dtype == np.uint16
+    assert np.count_nonzero(label) == one["pixels"]
+    assert "x 50</td>" in (out / "index.html").read_text()
+
+
+def test_a_table_is_printed(files, capsys):
+    assert cli.run(["perceive", *files, "--depth-scale", "0.0001"]) == 0
+    shown = capsys.readouterr().out
+    assert "red     box" in shown
+    assert "1 on a plane" in shown
+
+
+def test_a_cloud_gives_the_same(files, tmp_path, capsys):
+    _, of_images = call(capsys, *files, "--depth-scale", "0.0001")
+    code, answer = call(capsys, str(tmp_path / "a.pcd"))
+    assert code == 0
+    (a,), (b,) = of_images["clusters"], answer["clusters"]  # type: ignore[misc]
+    assert b["size"] == pytest.approx(a["size"], abs=5e-4)
+    assert b["centre"] == pytest.approx(a["centre"], abs=5e-4)
+
+
+def test_a_pose_gives_the_base_frame_and_a_background_what_is_new(files, tmp_path, capsys):
+    (tmp_path / "pose.txt").write_text("1 0 0 0.3\n0 -1 0 0\n0 0 -1 1.1\n0 0 0 1\n")
+    pose = ("--depth-scale", "0.0001", "--pose", str(tmp_path / "pose.txt"))
+    _, answer = call(capsys, *files, *pose)
+    assert answer["frame"] == "base"
+    assert answer["clusters"][0]["centre"] == pytest.approx([0.3, 0.0, 0.425], abs=0.003)  # type: ignore[index]
+    code, answer = call(capsys, *files, *pose, "--background", files[1])
+    assert (code, answer["clusters"]) == (0, [])
+
+
+@pytest.mark.parametrize(
+    ("argv", "exit_code", "words"),
+    [
+        (("{c}",), 2, "no depth image"),
+        (("{c}", "{z}"), 2, "no --info"),
+        (("{p}", "{z}"), 2, "is a cloud"),
+        (("{z}", "{c}", "--info", "{k}"), 1, "8 bits"),
+        (("{c}", "{z}", "--info", "{z}"), 1, "expected"),
+        (("{c}", "{z}", "--info", "{k}", "--depth-scale", "0"), 2, "depth scale"),
+        (("{c}", "{z}", "--info", "{k}", "--near", "2", "--far", "1"), 2, "near"),
+        (("{c}", "{z}", "--info", "{k}", "--pose", "{k}"), 1, "four rows"),
+        (("{c}", "{z}", "--info", "{k}", "--depth-scale", "0.0001", "--out", "{k}"), 2, "no folder"),
+        (("{c}", "{z}", "--info", "{k}", "--depth-scale", "0.00001"), 1, "no plane"),
+        (("{k}.pcd",), 1, "can't read"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_sentence(files, tmp_path, capsys, argv, exit_code, words):
+    names = {"c": files[0], "z": files[1], "k": files[3], "p": str(tmp_path / "a.pcd")}
+    code, answer = call(capsys, *(each.format(**names) for each in argv))
+    assert (code, answer["success"]) == (exit_code, False)
+    assert words in str(answer["message"])
+
+
+def test_the_cloud_is_left_as_it_is(files, tmp_path, capsys):
+    before = read_pcd(tmp_path / "a.pcd").points.copy()
+    call(capsys, str(tmp_path / "a.pcd"), "--far", "0.68")
+    assert np.array_equal(read_pcd(tmp_path / "a.pcd").points, before)

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Things on a table segmented by depth: what is found, what is said of outlines and shapes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_perception.geometry.depth import Deprojector, DepthLimits
+from openarm_perception.segmentation.clusters import Segmentation, segment
+from openarm_perception.segmentation.grouping import group
+from openarm_perception.segmentation.support import find_support
+from openarm_perception.segmentation.views import merge_views
+from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
+
+LIMITS = DepthLimits(near=0.1, far=3.0)
+
+
+def seen(view, noise: DepthNoiseConfig | None = None, seed: int = 0):
+    """Organised points of a view, noisy where asked for."""
+    depth = view.depth.copy()
+    if noise is not None:
+        depth = add_depth_noise(depth, view.intrinsics.fy, noise, np.random.default_rng(seed))
+    return Deprojector(LIMITS).organised(depth.astype(np.float32), view.intrinsics)
+
+
+def at(result: Segmentation, x: float, y: float):
+    """The cluster whose box is nearest to a place on the table."""
+    return min(result.clusters, key=lambda one: np.hypot(*(one.T_frame_box[:2, 3] - (x, y))))
+
+
+@pytest.mark.parametrize("noise", [None, DepthNoiseConfig(enabled=True)], ids=["clean", "noisy"])
+def test_boxes_and_cans_are_measured(tabletop, noise):
+    things = [
+        tabletop.Thing("red", "box", (0.05, 0.07, 0.06), 0.2, 0.15, 0.4),
+        tabletop.Thing("blue", "cylinder", (0.06, 0.06, 0.08), 0.35, -0.15),
+        tabletop.Thing("green", "box", (0.04, 0.04, 0.04), 0.3, 0.0, 1.0),
+    ]
+    view = tabletop.render(things)
+    result = segment(seen(view, noise), view.intrinsics, rgb=view.rgb, T_base_camera=view.T_base_camera)
+    assert len(result.clusters) == 3
+    assert result.label.dtype == np.uint16
+    for thing in things:
+        one = at(result, thing.x, thing.y)
+        assert one.shape.kind == ("box" if thing.kind == "box" else "cylinder"), one.shape.why
+        assert one.size == pytest.approx([*sorted(thing.size[:2]), thing.size[2]], abs=0.004)
+        assert one.T_frame_box[:3, 3] == pytest.approx(thing.position, abs=0.003)
+        assert one.outline.free > 0.97
+        assert one.outline.cut == ""
+        assert np.count_nonzero(one.mask) == one.pixels == np.count_nonzero(result.label == one.id)
+        # its points lie on it, in the base frame
+        assert one.points[:, 2].max() == pytest.approx(0.40 + thing.size[2], abs=0.02)
+
+
+def test_without_a_pose_the_table_may_be_slanted(tabletop):
+    thing = tabletop.Thing("red", "box", (0.05, 0.07, 0.06), 0.3, 0.0, 0.4)
+    camera = tabletop.look_at((0.9, 0.2, 0.8), (0.27, 0.0, 0.42), (0.0, 1.0, 0.0))
+    view = tabletop.render([thing], camera)
+    result = segment(seen(view), view.intrinsics)
+    assert len(result.clusters) == 1
+    one = result.clusters[0]
+    assert sorted(one.size) == pytest.approx(sorted(thing.size), abs=0.004)
+    # the pose of the box is that in the base frame, seen from the camera
+    T = view.T_base_camera @ one.T_frame_box
+    assert T[:3, 3] == pytest.approx(thing.position, abs=0.003)
+    assert T[:3, 2] == pytest.approx((0.0, 0.0, 1.0), abs=0.01)
+
+
+def test_what_is_no_prism_says_so_and_keeps_its_cloud(tabletop):
+    lying = tabletop.Thing("red", "cylinder", (0.06, 0.06, 0.12), 0.3, 0.0, 0.5, lying=True)
+    view = tabletop.render([lying])
+    result = segment(seen(view), view.intrinsics, T_base_camera=view.T_base_camera)
+    assert len(result.clusters) == 1
+    one = result.clusters[0]
+    assert one.shape.kind == "unknown"
+    assert one.shape.why != ""
+    assert "hid" not in one.shape.why
+    assert one.outline.cut == ""
+    assert one.size[:2] == pytest.approx((0.06, 0.12), abs=0.006)
+    assert one.pixels > 1000
+
+
+def test_what_is_in_front_hides_and_the_border_cuts(tabletop):
+    behind = tabletop.Thing("red", "box", (0.05, 0.16, 0.05), 0.22, 0.0)
+    front = tabletop.Thing("blue", "box", (0.03, 0.05, 0.12), 0.34, 0.0)
+    camera = tabletop.look_at((0.95, 0.0, 0.75), (0.30, 0.0, 0.42), (0.0, 1.0, 0.0))
+    view = tabletop.render([behind, front], camera)
+    result = segment(seen(view), view.intrinsics, T_base_camera=camera)
+    hidden = at(result, behind.x, behind.y)
+    assert hidden.outline.hidden > 0.05
+    assert "something nearer" in hidden.outline.cut
+    assert at(result, front.x, front.y).outline.hidden < 0.02
+    points = seen(view)
+    u = int(np.nonzero(result.label == at(result, front.x, front.y).id)[1].mean())
+    cut = segment(points[:, :u].copy(), _narrow(view.intrinsics, u), T_base_camera=camera)
+    assert any(one.outline.border > 0.1 for one in cut.clusters)
+
+
+def _narrow(lens, width: int):
+    return type(lens)(width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
+
+
+def test_boxes_that_touch_are_apart_where_they_meet_in_a_notch(tabletop):
+    low = tabletop.Thing("grey", "box", (0.08, 0.08, 0.03), 0.3, 0.0)
+    tall = tabletop.Thing("grey", "box", (0.04, 0.04, 0.09), 0.362, 0.0)
+    view = tabletop.render([low, tall], tabletop.look_at((0.1, 0.5, 0.9), (0.3, 0.0, 0.42), (1.0, 0.0, 0.0)))
+    noise = DepthNoiseConfig(enabled=True)
+    for seed in range(3):
+        result = segment(seen(view, noise, seed), view.intrinsics, rgb=view.rgb, T_base_camera=view.T_base_camera)
+        assert len(result.clusters) == 2, seed
+
+
+def test_parts_of_one_plain_colour_are_one_thing(tabletop):
+    handle = tabletop.Thing("red", "box", (0.15, 0.03, 0.025), 0.3, 0.0)
+    head = tabletop.Thing("red", "box", (0.04, 0.10, 0.05), 0.395, 0.0)
+    view = tabletop.render([handle, head])
+    points = seen(view)
+    assert len(segment(points, view.intrinsics, rgb=view.rgb, T_base_camera=view.T_base_camera).clusters) == 1
+    assert len(segment(points, view.intrinsics, T_base_camera=view.T_base_camera).clusters) == 2
+
+
+def test_the_robot_is_no_thing(tabletop):
+    thing = tabletop.Thing("red", "box", (0.05, 0.07, 0.06), 0.3, 0.0)
+    view = tabletop.render([thing])
+    points = seen(view)
+    robot = segment(points, view.intrinsics, T_base_camera=view.T_base_camera).label > 0
+    result = segment(points, view.intrinsics, T_base_camera=view.T_base_camera, robot=robot)
+    assert result.clusters == ()
+    assert not result.label.any()
+
+
+def test_a_background_takes_away_what_was_there_before(tabletop):
+    tray = tabletop.Thing("grey", "box", (0.2, 0.3, 0.04), 0.3, 0.0)
+    thing = tabletop.Thing("red", "box", (0.05, 0.07, 0.02), 0.3, 0.0)
+    on_it = tabletop.Thing("red", "box", (0.05, 0.07, 0.09), 0.3, 0.0)
+    noise = DepthNoiseConfig(enabled=True)
+    empty, full = tabletop.render([tray]), tabletop.render([tray, on_it])
+    background, points = seen(empty, noise), seen(full, noise, 1)
+    found = segment(points, full.intrinsics, T_base_camera=full.T_base_camera, background=background)
+    assert len(found.clusters) == 1
+    assert found.clusters[0].size[:2] == pytest.approx(thing.size[:2], abs=0.008)
+    with pytest.raises(OpenArmError, match="same camera in the same place"):
+        segment(points, full.intrinsics, background=background[:-1])
+    with pytest.raises(OpenArmError, match="has it moved"):
+        segment(points, full.intrinsics, background=background + np.float32(0.5))
+
+
+def test_without_a_plane_nothing_is_found():
+    points = np.full((60, 80, 3), np.nan, np.float32)
+    with pytest.raises(OpenArmError) as error:
+        find_support(points)
+    assert error.value.code == Code.NOTHING_DETECTED
+    points[:] = np.random.default_rng(0).uniform(0.5, 1.5, points.shape)
+    with pytest.raises(OpenArmError, match="no plane"):
+        find_support(points)
+
+
+def test_noise_is_measured_at_the_plane(tabletop):
+    view = tabletop.render([])
+    noise = DepthNoiseConfig(enabled=True)
+    sigma = noise.subpixel / (noise.baseline * view.intrinsics.fy)
+    assert find_support(seen(view, noise)).noise == pytest.approx(sigma, rel=0.25)
+
+
+def test_views_of_one_table_are_merged(tabletop):
+    things = [
+        tabletop.Thing("red", "box", (0.05, 0.07, 0.06), 0.22, 0.12, 0.4),
+        tabletop.Thing("blue", "cylinder", (0.06, 0.06, 0.08), 0.35, -0.12),
+    ]
+    cameras = [
+        tabletop.look_at((0.55, 0.0, 1.10), (0.27, 0.0, 0.42), (0.0, 1.0, 0.0)),
+        tabletop.look_at((-0.2, 0.4, 0.9), (0.27, 0.0, 0.42), (1.0, 0.0, 0.0)),
+    ]
+    views = [tabletop.render(things, camera) for camera in cameras]
+    results = [segment(seen(v), v.intrinsics, T_base_camera=v.T_base_camera) for v in views]
+    merged = merge_views([result.clusters for result in results])
+    assert sorted(len(thing.seen) for thing in merged) == [2, 2]
+    assert {seen for thing in merged for seen in thing.seen} == {(0, 1), (0, 2), (1, 1), (1, 2)}
+    assert len(merge_views([results[0].clusters, ()])) == 2
+    # another table, half a metre beside: nothing overlaps
+    beside = [type(one)(**{**vars(one), "points": one.points + np.float32(0.5)}) for one in results[1].clusters]
+    assert len(merge_views([results[0].clusters, beside])) == 4
+
+
+def test_a_gap_in_a_notch_joins_nothing():
+    """Two rows of patches, each joined by sure votes, with one doubtful link among many that are against."""
+    pairs, weight = [], []
+    for row in (0, 10):
+        for i in range(1, 10):
+            pairs.append((row + i, row + i + 1) if i < 9 else (row + 1, row + 3))
+            weight.append(9.0)
+    for i in range(1, 10):
+        pairs.append((i, 10 + i))
+        weight.append(4.0 if i == 5 else -8.0)
+    root = group(21, np.array(pairs, np.int32), np.array(weight), np.full(len(pairs), 10.0))
+    assert len(set(root[1:10])) == len(set(root[11:20])) == 1
+    assert root[1] != root[11]
+
+
+def test_the_same_image_gives_the_same_clusters(tabletop):
+    view = tabletop.render([tabletop.Thing("red", "box", (0.05, 0.07, 0.06), 0.3, 0.0, 0.3)])
+    points = seen(view, DepthNoiseConfig(enabled=True))
+    a, b = (segment(points.copy(), view.intrinsics, T_base_camera=view.T_base_camera) for _ in range(2))
+    assert np.array_equal(a.label, b.label)
+    assert all(np.array_equal(x.T_frame_box, y.T_frame_box) for x, y in zip(a.clusters, b.clusters, strict=True))
+    assert se3.is_pose(a.clusters[0].T_frame_box)
