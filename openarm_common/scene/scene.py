@@ -14,10 +14,19 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, FiniteFloat, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    FiniteFloat,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from openarm_common import se3
 from openarm_common.config import Config, load_yaml, validate
@@ -27,6 +36,9 @@ from openarm_common.resources import is_file, models_dir
 from openarm_common.robot.folder import robot_name, robot_work
 from openarm_common.robot.work import Table
 from openarm_common.types import Array
+
+if TYPE_CHECKING:
+    from openarm_common.objects.posed import PosedObject
 
 Rgba = tuple[float, float, float, float]
 
@@ -43,41 +55,74 @@ PALETTE: Mapping[str, Rgba] = MappingProxyType(
 )
 #: Those of scenes: what is grey is found by no colour, so only depth and the map know it.
 COLORS: Mapping[str, Rgba] = MappingProxyType({**PALETTE, "grey": (0.45, 0.45, 0.45, 1.0)})
-Shape = Literal["box", "cylinder", "sphere"]
+Shape = Literal["box", "cylinder", "sphere", "mesh"]
+#: Those that sizes alone describe; a mesh is an object of `openarm_common.objects`.
 SHAPES: tuple[Shape, ...] = ("box", "cylinder", "sphere")
 RESERVED_NAMES = ("world", "floor", "table", "table_top")
 DENSITY = 700.0  # kg/m3, of an object without a mass: hard wood
-MAX_EDGE = 0.30  # m
+MAX_EDGE = 0.30  # m, of plain shapes; the limits of meshes are those of `openarm_common.objects.model`
 MIN_EDGE = 0.01  # m
-Edge = Annotated[float, Field(ge=MIN_EDGE, le=MAX_EDGE)]
+
+
+def _edge(value: float, info: ValidationInfo) -> float:
+    low, high = (0.0, 1.0) if info.data.get("shape") == "mesh" else (MIN_EDGE, MAX_EDGE)
+    if not low <= value <= high:
+        bound = f"greater than or equal to {low:g}" if value < low else f"less than or equal to {high:g}"
+        raise ValueError(f"Input should be {bound}")
+    return value
+
+
+Edge = Annotated[FiniteFloat, AfterValidator(_edge)]
+Quaternion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 #: Centre to centre in a random scene: the open fingers reach 65 mm to either side, an object up to 50 mm.
 SPACING = 0.12
 _TOUCH = 1e-4  # m; closer than this is touching, not overlapping
 
 
 class SceneObject(Config):
-    """A free body in one plain colour.
+    """A free body: a plain shape in one colour, or a mesh.
 
     `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height; a
-    sphere's diameter three times.
+    sphere's diameter three times; of a mesh, the upright box around it as it lies, which follows from the object.
     `position` is x, y, or x, y, z of the centre; without z the object is on the table.
     """
 
     name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
-    label: str = Field(default="", description="what the detector calls it; the colour where it is not given")
+    label: str = Field(
+        default="", description="what the detector calls it; the colour, or of a mesh its object's label"
+    )
     shape: Shape
-    size: tuple[Edge, Edge, Edge] = Field(description="extents, m")
-    color: str = Field(description="a colour of the palette, or grey")
-    mass: float = Field(default=0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood")
+    size: tuple[Edge, Edge, Edge] = Field(description="extents, m; not given for a mesh")
+    color: str = Field(description="a colour of the palette, or grey; not given for a mesh")
+    mass: float = Field(
+        default=0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood, or its object's"
+    )
     position: tuple[FiniteFloat, FiniteFloat] | tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
         description="of the centre, m"
     )
     yaw: FiniteFloat = Field(default=0.0, description="rad")
+    object: str = Field(
+        default="", description="of a mesh: name in models/objects, path of a folder, or superquadric:SEED"
+    )
+    side: int = Field(default=0, ge=0, description="of a mesh: the side that it rests on, the most frequent is 0")
+    attitude: Quaternion | None = Field(
+        default=None, description="of a mesh that rests on no side: x, y, z, w of its own frame where yaw is 0"
+    )
 
     @model_validator(mode="before")
     @classmethod
-    def _label_is_color(cls, data: Any) -> Any:
-        return {"label": data.get("color", "")} | data if isinstance(data, dict) else data
+    def _completed(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        if data.get("shape") == "mesh":
+            return _mesh_keys(data)  # pyright: ignore[reportUnknownArgumentType]
+        return {"label": data.get("color", "")} | data
+
+    @model_serializer(mode="wrap")
+    def _own_keys(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what only a mesh has."""
+        told = handler(self)
+        return told if self.shape == "mesh" else {key: told[key] for key in told if key not in _OF_MESHES}
 
     @field_validator("name")
     @classmethod
@@ -91,25 +136,42 @@ class SceneObject(Config):
 
     @field_validator("color")
     @classmethod
-    def _known_color(cls, value: str) -> str:
-        if value not in COLORS:
+    def _known_color(cls, value: str, info: ValidationInfo) -> str:
+        if value not in COLORS and (value or info.data.get("shape") != "mesh"):
             raise ValueError(f"unknown colour; colours: {', '.join(COLORS)}")
         return value
 
     @model_validator(mode="after")
-    def _round(self) -> SceneObject:
+    def _of_its_shape(self) -> SceneObject:
+        if self.shape == "mesh":
+            return self
+        if self.object or self.side or self.attitude:
+            raise ValueError(f"{', '.join(_OF_MESHES)} are of the shape mesh; this is a {self.shape}")
         if self.shape == "sphere" and len(set(self.size)) > 1:
             raise ValueError(f"a sphere has one diameter; expected three equal extents, got {self.size}")
         return self
 
     @property
+    def posed(self) -> PosedObject:
+        """The object of a mesh, as it lies.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when its files are no longer what they were.
+        """
+        from openarm_common.objects.posed import posed_object
+
+        return posed_object(self.object, self.side, self.attitude)
+
+    @property
     def rgba(self) -> Rgba:
         """Colour."""
-        return COLORS[self.color]
+        return (*self.posed.model.rgb, 1.0) if self.shape == "mesh" else COLORS[self.color]
 
     @property
     def volume(self) -> float:
         """Cubic metres."""
+        if self.shape == "mesh":
+            return sum(part.volume for part in self.posed.parts)
         x, y, z = self.size
         return x * y * z * {"box": 1.0, "cylinder": math.pi / 4.0, "sphere": math.pi / 6.0}[self.shape]
 
@@ -129,12 +191,43 @@ class SceneObject(Config):
 
     def outline(self) -> Array:
         """Return the convex outline (n, 2) of the footprint in the base frame, m."""
-        if self.shape != "box":
+        if self.shape in ("cylinder", "sphere"):
             angles = np.arange(32) * (math.tau / 32.0)
             corners = np.stack([np.cos(angles), np.sin(angles)], axis=1) * (self.size[0] / 2.0)
         else:
             corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (np.array(self.size[:2]) / 2.0)
         return corners @ se3.rot_z(self.yaw)[:2, :2].T + np.array(self.position[:2])
+
+
+_OF_MESHES = ("object", "side", "attitude")
+
+
+def _mesh_keys(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a mesh with what its object says: label, mass, size.
+
+    Raises:
+        ValueError: With what is wrong with the object, for pydantic.
+    """
+    from openarm_common.objects.posed import posed_object
+
+    source, side, attitude = data.get("object"), data.get("side", 0), data.get("attitude")
+    if not isinstance(source, str) or not source or type(side) is not int:
+        raise ValueError("a mesh needs `object`: a name in models/objects, the path of a folder, or superquadric:SEED")
+    if attitude is not None:
+        numbers = np.array(attitude, np.float64) if _are_numbers(attitude) else np.zeros(0)
+        if numbers.shape != (4,) or not np.isfinite(numbers).all() or abs(np.linalg.norm(numbers) - 1.0) > 1e-3:
+            raise ValueError(f"attitude is {brief(attitude)}, expected a quaternion x, y, z, w of length 1")
+        attitude = tuple(numbers.tolist())
+    try:
+        posed = posed_object(source, side, attitude)
+    except OpenArmError as error:
+        raise ValueError(error.message) from error
+    told = {"label": posed.model.label, "color": "", **data, "size": posed.size}
+    return told | {"mass": data.get("mass") or posed.model.mass}
+
+
+def _are_numbers(values: Any) -> bool:
+    return isinstance(values, list | tuple) and all(isinstance(v, int | float) for v in values)  # pyright: ignore
 
 
 class Fixture(Config):
@@ -170,6 +263,15 @@ class Scene(Config):
     table: Table = Field(default_factory=lambda: robot_work().table)
     objects: tuple[SceneObject, ...] = ()
     fixtures: tuple[Fixture, ...] = ()
+    appearance: int | None = Field(
+        default=None, ge=0, description="seed of lamps, texture of the table and sheets of paper on it; none: plain"
+    )
+
+    @model_serializer(mode="wrap")
+    def _own_keys(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out a plain appearance."""
+        told = handler(self)
+        return {key: told[key] for key in told if key != "appearance" or self.appearance is not None}
 
     @field_validator("table", mode="before")
     @classmethod

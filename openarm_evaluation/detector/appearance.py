@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appearance of training pictures: shapes, colours, patterns of tables, and sensor effects.
+"""Appearance of training pictures: shapes and sensor effects; lamps, colours and tables are those of scenes.
 
 Lengths in m in the object's frame: origin in its middle, z along the axis of a cylinder.
 """
 
 from __future__ import annotations
 
-import colorsys
 import math
 
 import cv2
@@ -14,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.scene.scene import PALETTE
 from openarm_common.types import Array
 
 Rng = np.random.Generator
 
-#: Shares of cylinders that lie on their side, and of objects without colour.
-LYING, GREY = 0.12, 0.15
+#: Share of cylinders that lie on their side.
+LYING = 0.12
 
 
 def draw_shape(rng: Rng, kind: str) -> tuple[Array, Array]:
@@ -53,32 +51,6 @@ def surface(kind: str, half: Array) -> Array:
         return np.concatenate([np.c_[ring * half[0], np.full(32, z)] for z in (-half[2], half[2])])
     tilt = np.linspace(-math.pi / 2.0, math.pi / 2.0, 17)
     return np.concatenate([np.c_[ring * math.cos(t), np.full(32, math.sin(t))] for t in tilt]) * half[0]
-
-
-def colour(rng: Rng) -> Array:
-    """Red, green, blue, 0 to 1: of the palette, any, or none."""
-    draw = rng.random()
-    if draw < GREY:
-        return np.clip(rng.uniform(0.08, 0.95) + rng.uniform(-0.04, 0.04, 3), 0.0, 1.0)
-    if draw < 0.5:
-        return np.array(colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.4, 1.0), rng.uniform(0.3, 1.0)))
-    base = np.array(PALETTE[str(rng.choice(list(PALETTE)))][:3])
-    return np.clip(base * rng.uniform(0.8, 1.15) + rng.uniform(-0.04, 0.04, 3), 0.0, 1.0)
-
-
-def pattern(rng: Rng, kind: int) -> NDArray[np.uint8]:
-    """A texture (128, 128, 3): planks, tiles or cloudy stone."""
-    light, dark = rng.uniform(0.6, 1.0), rng.uniform(0.45, 0.9)
-    tone = rng.uniform(0.8, 1.0, 3)
-    if kind == 0:
-        grain = rng.random(128)[:, None] * 0.5 + cv2.GaussianBlur(rng.random((128, 128)), (31, 1), 0) * 0.5
-    elif kind == 1:
-        grain = np.indices((128, 128)).sum(0) // 16 % 2 * 1.0
-    else:
-        grain = cv2.GaussianBlur(rng.random((128, 128)), (0, 0), 5.0)
-        grain = (grain - grain.min()) / (grain.max() - grain.min())
-    value = dark + (light - dark) * grain
-    return np.clip(value[..., None] * tone * 255.0, 0, 255).astype(np.uint8)
 
 
 def sensor(rng: Rng, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -22,8 +22,17 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
 from openarm_common.scene.scene import SHAPES, Scene, SceneObject
 from openarm_common.types import Array
-from openarm_evaluation.detector.appearance import colour, draw_shape, pattern, sensor, surface
+from openarm_evaluation.detector.appearance import draw_shape, sensor, surface
 from openarm_sim_bridge.cameras.renderer import create_gl_context
+from openarm_sim_bridge.world.appearance import (
+    PATTERNS,
+    add_texture,
+    colour,
+    draw_floor,
+    draw_lamps,
+    draw_table,
+    pattern,
+)
 from openarm_sim_bridge.world.model import build_spec
 from openarm_sim_bridge.world.world import start_qpos
 
@@ -143,9 +152,7 @@ class RandomViews:
             body.add_geom(name=f"other_{i}", type=kind, size=(0.03, 0.05, 0.05), group=0)
         rng = np.random.default_rng(11)
         for i in range(_TEXTURES):
-            texture = spec.add_texture(name=f"pattern_{i}", type=mujoco.mjtTexture.mjTEXTURE_2D, width=128, height=128)
-            texture.nchannel = 3
-            texture.data = pattern(rng, i % 3).tobytes()
+            add_texture(spec, f"pattern_{i}", pattern(rng, i % PATTERNS))
             material = spec.add_material(name=f"pattern_{i}", specular=0.05, shininess=0.1)
             material.texrepeat = tuple(rng.uniform(0.5, 4.0, 2))
             material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = f"pattern_{i}"
@@ -153,28 +160,20 @@ class RandomViews:
 
     # --- environment
     def _light(self, rng: Rng) -> None:
-        model = self._model
-        head = model.vis.headlight
-        head.ambient[:] = rng.uniform(0.2, 0.5)
-        head.diffuse[:] = rng.uniform(0.05, 0.4)
-        for i in range(model.nlight):
-            direction = np.array([*rng.uniform(-0.9, 0.9, 2), -1.0])
-            model.light_dir[i] = direction / np.linalg.norm(direction)
-            model.light_diffuse[i] = rng.uniform(0.1, 0.65) * rng.uniform(0.88, 1.0, 3)
-            model.light_specular[i] = rng.uniform(0.0, 0.2)
+        model, lamps = self._model, draw_lamps(rng, self._model.nlight)
+        model.vis.headlight.ambient[:] = lamps.ambient
+        model.vis.headlight.diffuse[:] = lamps.diffuse
+        model.light_dir[:], model.light_diffuse[:] = lamps.directions, lamps.colors
+        model.light_specular[:] = lamps.specular[:, None]
 
     def _surfaces(self, rng: Rng) -> None:
         model = self._model
         top = model.geom("table_top").id
-        if rng.random() < 0.5:
-            model.geom_matid[top] = model.material("table").id
-            tint = rng.uniform(0.45, 0.95) * rng.uniform(0.9, 1.0, 3)
-        else:
-            model.geom_matid[top] = model.material(f"pattern_{rng.integers(_TEXTURES)}").id
-            tint = rng.uniform(0.4, 1.0) * rng.uniform(0.75, 1.0, 3)
+        kind, tint = draw_table(rng, _TEXTURES)
+        model.geom_matid[top] = model.material("table" if kind is None else f"pattern_{kind}").id
         model.geom_rgba[top] = (0.5, 0.5, 0.5, 1.0)  # the default: anything else would override the material
         model.mat_rgba[model.geom_matid[top]] = (*tint, 1.0)
-        model.geom_rgba[model.geom("floor").id, :3] = rng.uniform(0.2, 0.75) * rng.uniform(0.8, 1.0, 3)
+        model.geom_rgba[model.geom("floor").id, :3] = draw_floor(rng)
 
     def _pose_robot(self, rng: Rng, camera: str) -> None:
         description = self._description

@@ -27,6 +27,7 @@ from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.xml_text import floats
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
+from openarm_sim_bridge.world.appearance import vary
 from openarm_sim_bridge.world.hardware import IDEAL, Hardware, drawn
 from openarm_sim_bridge.world.touch import add_hand_sensors
 from openarm_sim_bridge.world.world import compiled_model
@@ -111,6 +112,8 @@ def build_spec(
     }
     scenery.add_environment(spec, contact)
     scenery.add_table(spec, scene.table, contact)
+    if scene.appearance is not None:
+        vary(spec, scene.table, scene.appearance)
     for item in scene.objects:
         scenery.add_object(spec, item, scene.table, contact, settings.object_condim)
     for fixture in scene.fixtures:

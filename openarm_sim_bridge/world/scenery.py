@@ -21,6 +21,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_common.robot.work import Table
 from openarm_common.scene.scene import Fixture, SceneObject
+from openarm_sim_bridge.world.object_meshes import add_mesh
 
 _TABLE_RGBA = (0.80, 0.785, 0.76, 1.0)
 _FLOOR_RGBA = (0.48, 0.48, 0.49, 1.0)  # plain: a texture that fills half of an image doubles the cost of drawing it
@@ -129,6 +130,9 @@ def add_object(spec: mujoco.MjSpec, item: SceneObject, table: Table, contact: Ma
         name=item.name, pos=item.centre(table), quat=(math.cos(item.yaw / 2.0), 0.0, 0.0, math.sin(item.yaw / 2.0))
     )
     body.add_freejoint(name=item.name)
+    if item.shape == "mesh":
+        add_mesh(spec, body, item, contact, condim)
+        return
     x, y, z = item.size
     if item.shape == "cylinder":
         kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, (x / 2.0, z / 2.0, 0.0)

@@ -82,7 +82,7 @@ def test_mass_follows_from_the_volume_where_none_is_given() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"shape": "ball"}, "objects.0.shape: Input should be 'box', 'cylinder' or 'sphere', got 'ball'"),
+        ({"shape": "ball"}, "objects.0.shape: Input should be 'box', 'cylinder', 'sphere' or 'mesh', got 'ball'"),
         ({"shape": "sphere", "size": [0.05, 0.05, 0.06]}, "objects.0: .*a sphere has one diameter"),
         ({"color": "pink"}, "objects.0.color: .*colours: red, orange, yellow, green, blue, purple, grey, got 'pink'"),
         ({"size": [0.05, 0.05, 0.31]}, "objects.0.size.2: .*less than or equal to 0.3, got 0.31"),
