@@ -46,7 +46,13 @@ COMMANDS = {
     "Inspect": ("processes:ps", "processes:logs", "doctor:doctor", "tf:tf", "hardware:hardware"),
     "Messages": ("ros2:topic", "ros2:service", "ros2:action", "ros2:node", "ros2:param"),
     "Record and check": ("perceive:perceive", "record:record", "record:replay", "record:check"),
-    "Models and graphs": ("model:model", "graph:graph", "grasp:grasp", f"{EVALUATION}.detector:detector"),
+    "Models and graphs": (
+        "model:model",
+        "graph:graph",
+        "grasp:grasp",
+        f"{EVALUATION}.detector:detector",
+        f"{EVALUATION}.objects:objects",
+    ),
     "Develop": ("checks:test", "checks:lint", f"{EVALUATION}.chaos:chaos", "checks:completion"),
 }
 

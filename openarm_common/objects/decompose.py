@@ -45,7 +45,7 @@ def decomposed(vertices: Array, triangles: Ints, where: str) -> list[Array]:
     if (kept := _read(path)) is not None:
         return kept
     try:
-        import coacd
+        import coacd  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise OpenArmError(
             Code.ENVIRONMENT,

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands of the command line that evaluate: demo, campaign, chaos, detector."""
+"""Commands of the command line that evaluate: demo, campaign, chaos, detector, objects."""
