@@ -205,10 +205,10 @@ def _down(normal: Array, points: Array) -> Array:
     x = np.cross((0.0, 1.0, 0.0) if abs(z[1]) < 0.9 else (1.0, 0.0, 0.0), z)
     x /= np.linalg.norm(x)
     R = np.stack([x, np.cross(z, x), z])
-    return se3.rot_z(-_least_box_yaw((points @ R.T)[:, :2]))[:3, :3] @ R
+    return se3.rot_z(-least_box_yaw((points @ R.T)[:, :2]))[:3, :3] @ R
 
 
-def _least_box_yaw(points: Array) -> float:
+def least_box_yaw(points: Array) -> float:
     """Return the direction of the shorter edge of the smallest rectangle about points (n, 2), rad in (-pi/2, pi/2]."""
     corners = points[ConvexHull(points).vertices]
     edges = np.roll(corners, -1, axis=0) - corners

@@ -98,26 +98,38 @@ def mass_centre(parts: Sequence[Part]) -> Array:
     return volumes @ np.array([part.centre for part in parts]) / volumes.sum()
 
 
-def along(parts: Sequence[Part], points: Array, direction: Array) -> Array:
-    """Where lines are inside parts: (k parts, n lines, 2) from and to, m along the direction; from > to: not at all.
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Where parallel lines are inside a part.
+
+    Attributes:
+        ends: (n, 2) from and to, m along the direction; from > to: not at all.
+        normals: (n, 2, 3) outward, of the faces there.
+    """
+
+    ends: Array
+    normals: Array
+
+
+def crossings(part: Part, points: Array, direction: Array) -> Crossings:
+    """Return where lines cross a part.
 
     Args:
-        parts: In the frame of the lines.
+        part: In the frame of the lines.
         points: (n, 3) of the lines, m.
         direction: (3,) unit, of all lines.
     """
-    out = np.empty((len(parts), len(points), 2))
-    for k, part in enumerate(parts):
-        normal, offset = part.planes[:, :3], part.planes[:, 3]
-        rate = normal @ direction
-        left = -(points @ normal.T + offset)  # (n, planes) room before each plane
-        with np.errstate(divide="ignore", invalid="ignore"):
-            at = left / rate
-        parallel = np.abs(rate) < 1e-12
-        low = np.where(rate < 0.0, at, -np.inf)
-        high = np.where(rate > 0.0, at, np.inf)
-        low[:, parallel], high[:, parallel] = -np.inf, np.inf
-        outside = (left[:, parallel] < 0.0).any(axis=1)
-        out[k, :, 0] = np.where(outside, np.inf, low.max(axis=1))
-        out[k, :, 1] = np.where(outside, -np.inf, high.min(axis=1))
-    return out
+    normal, offset = part.planes[:, :3], part.planes[:, 3]
+    rate = normal @ direction
+    left = -(points @ normal.T + offset)  # (n, planes) room before each plane
+    parallel = np.abs(rate) < 1e-12
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = left / rate
+    low = np.where((rate < 0.0) & ~parallel, at, -np.inf)
+    high = np.where((rate > 0.0) & ~parallel, at, np.inf)
+    outside = (left[:, parallel] < 0.0).any(axis=1)
+    first, last = low.argmax(axis=1), high.argmin(axis=1)
+    row = np.arange(len(points))
+    ends = np.stack([low[row, first], high[row, last]], axis=1)
+    ends[outside] = np.inf, -np.inf
+    return Crossings(ends, np.stack([normal[first], normal[last]], axis=1))

@@ -69,7 +69,7 @@ def run_campaign(
             the program did to one task is in its row.
     """
     for seed in options.seeds[:1]:
-        make_task(options.set_name, seed)  # faults of the call show before anything is started
+        make_task(options.set_name, seed, options.objects)  # faults of the call show before anything is started
     suite = suite_config(options.graph_parameters())
     detector = suite.detectors[suite.grasp.camera].detector  # as --set leaves it
     rows = [{"detector": detector} | row for row in read_rows(folder, options)]

@@ -136,7 +136,7 @@ def _prepare_robots(options: CampaignOptions, seeds: Sequence[int], folder: Path
     turns = [len(draws) or 1 for draws in (options.mount_seeds, options.dynamics_seeds)]
     first = {tuple(seed % turn for turn in turns): seed for seed in reversed(seeds)}
     for seed in first.values():
-        with_robot(make_task(options.set_name, seed), options, folder)
+        with_robot(make_task(options.set_name, seed, options.objects), options, folder)
 
 
 def _check_versions(answer: _Answer) -> None:

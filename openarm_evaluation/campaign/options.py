@@ -15,6 +15,7 @@ from openarm_bringup.commands.connect import Robot
 from openarm_common.camera.cameras import detector_nodes
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.folder import DEFAULT, robot_name
+from openarm_evaluation.campaign.tasks.things import THINGS
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_sim_bridge.config import FaceName, Profile
 
@@ -60,7 +61,8 @@ class CampaignOptions:
     """What a campaign runs.
 
     Args:
-        set_name: nominal, clutter, faults, endurance, handover, push, pairs or pairs_in_turn.
+        set_name: nominal, clutter, faults, endurance, handover, push, pairs, pairs_in_turn, objects or heap; --set NAME
+            means the same.
         seeds: One task each, such as 0-99 or 1,4,7-9; 0-9 when not given.
         workers: Processes.
         noise: Depth as noisy as a D435's.
@@ -70,7 +72,10 @@ class CampaignOptions:
         controllers: Of the robot: suite, or openarm_ros2 with the profile openarm, through the graph alone.
         identify: Whether the servos of each draw are identified first.
         use_effort: Whether the force of the fingers counts as evidence.
-        detector: What finds objects: their colour, the network, both checking each other, a tag on them, or depth.
+        objects: Of the suites objects and heap: a folder of object folders, or superquadrics:N; those of models/objects
+            when not given.
+        detector: What finds objects: their colour, the network, both checking each other, a tag on them, or depth
+            (anything). Colour, and depth in the suites objects and heap, when not given.
         parameters: A parameter of a node of the graph `sim`, as node.param=value; may be given several times.
         ray: Address of a Ray cluster, such as HOST:6379 or auto, whose machines run the workers.
     """
@@ -85,10 +90,31 @@ class CampaignOptions:
     dynamics_seeds: Seeds = (1,)
     identify: Annotated[bool, Parameter(negative="--no-identify")] = True
     use_effort: Annotated[bool, Parameter(name="--effort", negative="--no-effort")] = True
-    detector: DetectorKind = "color"
+    objects: str = ""
+    detector: DetectorKind | None = None
     parameters: Annotated[tuple[str, ...], Parameter(name="--set")] = ()
     ray: str = ""
     robot: Robot = None
+
+    def __post_init__(self) -> None:
+        """Take a `--set` without a value for the name of the suite.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when two suites are named.
+        """
+        suites = [item for item in self.parameters if "=" not in item and "." not in item]
+        if self.set_name != "nominal":
+            suites.insert(0, self.set_name)
+        if len(set(suites)) > 1:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"one suite at a time, got {' and '.join(map(repr, suites))}")
+        parameters = tuple(item for item in self.parameters if item not in suites)
+        object.__setattr__(self, "set_name", suites[0] if suites else self.set_name)
+        object.__setattr__(self, "parameters", parameters)
+
+    @property
+    def finder(self) -> DetectorKind:
+        """What finds objects, where nothing is said: depth alone in suites of any shape."""
+        return self.detector or ("anything" if self.set_name in THINGS else "color")
 
     def settings(self) -> dict[str, Any]:
         """What must be the same for rows to belong together."""
@@ -99,7 +125,8 @@ class CampaignOptions:
             "mount_seeds": list(self.mount_seeds),
             **self._profile_settings(),
             "use_effort": self.use_effort,
-            **({"detector": self.detector} if self.detector != "color" else {}),
+            **({"objects": self.objects} if self.objects else {}),
+            **({"detector": self.finder} if self.finder != "color" else {}),
             **({"parameters": list(self.parameters)} if self.parameters else {}),
         }
 
@@ -116,7 +143,7 @@ class CampaignOptions:
             f"mujoco_bridge.depth_noise.enabled={str(self.noise).lower()}",
             f"mujoco_bridge.profile={self.profile}",
             f"grasp.held.use_effort={str(self.use_effort and self.controllers == 'suite').lower()}",
-            *(f"{node}.detector={self.detector}" for node in detector_nodes().values()),
+            *(f"{node}.detector={self.finder}" for node in detector_nodes().values()),
             *self.parameters,
         )
 
@@ -137,6 +164,7 @@ class CampaignOptions:
             parts.append("" if self.controllers == "suite" else f"--controllers {self.controllers}")
             parts.append("" if self.identify else "--no-identify")
         parts.append("" if self.use_effort else "--no-effort")
-        parts.append(f"--detector {self.detector}" if self.detector != "color" else "")
+        parts.append(f"--objects {shlex.quote(self.objects)}" if self.objects else "")
+        parts.append(f"--detector {self.detector}" if self.detector not in (None, "color") else "")
         parts += [f"--set {shlex.quote(item)}" for item in self.parameters]
         return " ".join(part for part in parts if part)

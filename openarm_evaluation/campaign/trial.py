@@ -27,7 +27,7 @@ from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, watch_clearance
-from openarm_evaluation.judging.judge import RULES, at_rest, end_of, judge
+from openarm_evaluation.judging.judge import RULES, at_rest, end_of, judge, rise_of
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial, choose_targets
 from openarm_grasp.config import GraspConfig
@@ -215,8 +215,9 @@ class Trials:
         self._rest(names)
         where = outcome.place_position
         xy = (where[0], where[1]) if any(where) else (math.nan, math.nan)
-        name = max(names, key=lambda n: max(float(s.p_world[2]) for s in robot.tracks[n]))
-        verdict = judge(robot.tracks[name], xy, claimed=outcome.success)
+        name = max(names, key=lambda n: rise_of(robot.tracks[n]))
+        any_shape = task.scene.object(name).shape == "mesh"
+        verdict = judge(robot.tracks[name], xy, claimed=outcome.success, any_shape=any_shape)
         return Trial(task.scene, task.seed, name, outcome, verdict, steps, wall_s, end_ns)
 
     def _rest(self, names: list[str]) -> None:
@@ -251,7 +252,7 @@ def with_robot(
 
 def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
     """Run one task in this process and return its row, whatever happens."""
-    task, sets = make_task(options.set_name, seed), options.graph_parameters()
+    task, sets = make_task(options.set_name, seed, options.objects), options.graph_parameters()
     try:
         task, mounts, servos = with_robot(task, options, folder)
         trials = Trials(
@@ -332,4 +333,13 @@ def _head(task: Task, targets: int) -> dict[str, Any]:
         "objects": len(task.scene.objects),
         "targets": targets,
         "expected": ["placed" if code is Code.OK else code.value for code in task.codes],
+        **({"things": _things(task)} if task.graspable else {}),
+    }
+
+
+def _things(task: Task) -> dict[str, Any]:
+    """What a row says of objects of any shape: which, on which side, and why a hand can't take it ("": it can)."""
+    return {
+        item.name: {"object": item.object, "side": item.side, "why_not": task.graspable[item.name]}
+        for item in task.scene.objects
     }

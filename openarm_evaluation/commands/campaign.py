@@ -53,7 +53,7 @@ def campaign(
     folder = (out or runs.new_run_dir()).resolve()
     others = rows_of(against) if against is not None else []
     runner, parts = rows_of_graph if graph else None, list[Campaign]()
-    for kind in detectors or (options.detector,):
+    for kind in detectors or (options.finder,):
         below = folder / kind if detectors else folder
         with Watch(len(options.seeds), console()) as watch:
             part = replace(options, detector=kind)

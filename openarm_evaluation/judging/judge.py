@@ -31,9 +31,13 @@ class JudgeConfig(Config):
     speed: float = Field(default=0.005, gt=0, description="m/s at rest")
     turn: float = Field(default=0.05, gt=0, description="rad/s at rest")
     rest: float = Field(default=0.5, gt=0, description="s of simulated time at rest at the end")
+    fall: float = Field(default=0.02, gt=0, description="m, of free fall that is none yet; of objects of any shape")
 
 
 RULES = JudgeConfig()
+_GRAVITY = 9.81
+#: Share of gravity from which on something falls: nothing that a hand carries is let down so fast.
+_FREELY = 0.7
 
 
 @dataclass(frozen=True)
@@ -71,15 +75,23 @@ class Verdict:
 
 
 def judge(
-    track: Sequence[Sample], target_xy: tuple[float, float], *, claimed: bool, rules: JudgeConfig = RULES
+    track: Sequence[Sample],
+    target_xy: tuple[float, float],
+    *,
+    claimed: bool,
+    rules: JudgeConfig = RULES,
+    any_shape: bool = False,
 ) -> Verdict:
     """Judge one object's track from before the grasp to after it.
+
+    An object of any shape may rest on another side than before, since the request promises none, but not have fallen.
 
     Args:
         track: Samples in the order of time, the first from before anything moved.
         target_xy: Where the footprint centre should be, m, world; NaN when no place was chosen.
         claimed: Whether the run reported success.
         rules: Tolerances.
+        any_shape: Whether it is no plain shape.
 
     Raises:
         ValueError: The track is empty or not in the order of time.
@@ -88,7 +100,7 @@ def judge(
         raise ValueError(f"a track needs samples in the order of time, got {len(track)}")
     first, last = track[0], track[-1]
     error = math.hypot(last.p_world[0] - target_xy[0], last.p_world[1] - target_xy[1])
-    rise = float(max(sample.p_world[2] for sample in track) - first.p_world[2])
+    rise = rise_of(track)
     tilt = _tilt(first.q_xyzw, last.q_xyzw)
     end = end_of(track, rules)
     speed = max(float(np.linalg.norm(sample.linear)) for sample in end)
@@ -103,14 +115,33 @@ def judge(
         reasons.append(
             f"is {1e3 * error:.1f} mm from the target, at most {1e3 * rules.place_tolerance:.0f} are allowed"
         )
-    if tilt > rules.tilt:
+    if any_shape:
+        if (fell := fall_of(track)) > rules.fall:
+            reasons.append(f"fell: {1e3 * fell:.0f} mm freely, at most {1e3 * rules.fall:.0f} are allowed")
+    elif tilt > rules.tilt:
         reasons.append(f"not upright: tilted by {math.degrees(tilt):.0f} degrees")
-    if abs(sink) > rules.height:
+    if not any_shape and abs(sink) > rules.height:
         reasons.append(f"is not on the table as before: its centre is {1e3 * sink:+.0f} mm higher")
     if speed > rules.speed or turn > rules.turn:
         reasons.append(f"not at rest: {1e3 * speed:.0f} mm/s, {turn:.2f} rad/s")
     placed = not reasons
     return Verdict(placed, tuple(reasons), error, rise, tilt, speed, claimed and not placed)
+
+
+def rise_of(track: Sequence[Sample]) -> float:
+    """Return by how much an object was higher at most than at first, m."""
+    return float(max(sample.p_world[2] for sample in track) - track[0].p_world[2])
+
+
+def fall_of(track: Sequence[Sample]) -> float:
+    """Return from how high an object fell freely, by the speed that it reached downwards in doing so, m."""
+    fastest = 0.0
+    for before, after in itertools.pairwise(track):
+        seconds = max((after.t_ns - before.t_ns) * 1e-9, 1e-9)
+        faster = float(before.linear[2] - after.linear[2])
+        if after.linear[2] < 0.0 and faster > _FREELY * _GRAVITY * seconds:
+            fastest = max(fastest, -float(after.linear[2]))
+    return fastest**2 / (2.0 * _GRAVITY)
 
 
 def end_of(track: Sequence[Sample], rules: JudgeConfig = RULES) -> list[Sample]:

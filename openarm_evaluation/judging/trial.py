@@ -130,7 +130,7 @@ def choose_targets(scene: Scene, words: str) -> tuple[SceneObject, ...]:
     things: dict[Detection, SceneObject] = {}
     for item in scene.objects:
         name, size = "" if item.label == item.color else item.label, np.array(item.size)
-        kind, T = kind_of(item.shape, size), item.T_world_object(scene.table)
+        kind, T = "" if item.shape == "mesh" else kind_of(item.shape, size), item.T_world_object(scene.table)
         things[Detection(name, 1.0, T, size, kind=kind, color=item.color)] = item
     try:
         return tuple(things[one] for one in select(words, tuple(things)))
@@ -251,7 +251,8 @@ def _observed(
     for item, result in zip(items, results, strict=True):
         chosen = result.place_position if any(result.place_position) else (math.nan, math.nan)
         x, y = (place or chosen)[:2]
-        verdict = judge(observer.track(item.name), (x, y), claimed=result.success)
+        any_shape = item.shape == "mesh"
+        verdict = judge(observer.track(item.name), (x, y), claimed=result.success, any_shape=any_shape)
         steps = [step for step in observer.steps() if len(items) == 1 or step.label in (item.label, result.label)]
         trials.append(Trial(scene, seed, item.name, result, verdict, _stamped(steps), wall_s))
     return trials

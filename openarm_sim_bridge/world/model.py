@@ -151,7 +151,7 @@ def robot_spec(
     """
     hardware = hardware or drawn(IDEAL, description)
     spec = _import_urdf(description)
-    _set_options(spec, physics)
+    set_options(spec, physics)
     for side in description.arm_names:
         _actuate_arm(spec, description, side, hardware)
         _actuate_gripper(spec, description, side, physics)
@@ -204,7 +204,8 @@ def _take_files(root: ET.Element) -> dict[str, bytes]:
     return assets
 
 
-def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
+def set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
+    """Set time step, solver and contact model of a world."""
     option = spec.option
     for key in ("timestep", "impratio", "iterations", "noslip_iterations"):
         setattr(option, key, getattr(physics, key))

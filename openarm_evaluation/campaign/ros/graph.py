@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 #: Longest wait for a recording, s: a busy machine takes a while.
 _WRITTEN_S = 60.0
 #: Sets without fault injection, in which a request does not depend on the outcome of those before.
-GRAPH_SETS = ("nominal", "handover", "push", "pairs", "pairs_in_turn")
+GRAPH_SETS = ("nominal", "objects", "handover", "push", "pairs", "pairs_in_turn")
 
 
 def rows_of_graph(options: CampaignOptions, seeds: Sequence[int], folder: Path, keep: Callable[[Row], None]) -> None:
@@ -78,7 +78,7 @@ async def _run(options: CampaignOptions, seeds: Sequence[int], folder: Path, kee
 
             def work() -> None:
                 for seed in seeds:
-                    row = _row(observer, client, make_task(options.set_name, seed), folder / "scenes")
+                    row = _row(observer, client, make_task(options.set_name, seed, options.objects), folder / "scenes")
                     row = {**row, "again": f"{options.command(seed)} --graph"}
                     if not row["as_expected"]:
                         keep_recording(client, row, folder / "failures" / str(seed))
@@ -92,7 +92,7 @@ def _robot(options: CampaignOptions, folder: Path) -> tuple[str, ...]:
     if options.profile == "ideal":
         return ()
     servos = folder / "servos"
-    task, _ = with_servos(make_task(options.set_name, options.seeds[0]), options, servos)
+    task, _ = with_servos(make_task(options.set_name, options.seeds[0], options.objects), options, servos)
     seed = task.dynamics_seed
     known = (servos / str(seed)).absolute()
     carrying = (f"mujoco_bridge.calibrations={known}",)

@@ -7,6 +7,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_evaluation.campaign.tasks.faults import fault_task
 from openarm_evaluation.campaign.tasks.task import Task, clutter, endurance, nominal
+from openarm_evaluation.campaign.tasks.things import THINGS, heap_task, objects_task
 from openarm_evaluation.campaign.tasks.two_arms import handover_task, in_turn_task, pair_task, push_task
 
 #: Makers of tasks by the name of the suite.
@@ -19,13 +20,20 @@ SUITES = {
     "push": push_task,
     "pairs": pair_task,
     "pairs_in_turn": in_turn_task,
+    "objects": objects_task,
+    "heap": heap_task,
 }
 #: Those that two arms share.
 OF_TWO_ARMS = ("handover", "pairs", "pairs_in_turn")
 
 
-def make_task(set_name: str, seed: int) -> Task:
+def make_task(set_name: str, seed: int, objects: str = "") -> Task:
     """Make the task of a suite and a seed, for this process's robot.
+
+    Args:
+        set_name: Of the suite.
+        seed: Of the task.
+        objects: Which objects suites of any shape take, as `things.object_sources`.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the suites; a suite of two arms, for a robot with one.
@@ -36,5 +44,10 @@ def make_task(set_name: str, seed: int) -> Task:
     if set_name in OF_TWO_ARMS and len(robot.arm_names) < 2:
         mine = ", ".join(name for name in SUITES if name not in OF_TWO_ARMS)
         text = f"suite {set_name!r} needs two arms, robot {robot.name!r} has {len(robot.arm_names)}; suites: {mine}"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
+    if set_name in THINGS:
+        return objects_task(seed, objects) if set_name == "objects" else heap_task(seed, objects)
+    if objects:
+        text = f"--objects is of the suites {', '.join(THINGS)}, not of {set_name!r}"
         raise OpenArmError(Code.INVALID_ARGUMENT, text)
     return SUITES[set_name](seed)

@@ -57,6 +57,7 @@ class Task:
         clear: Repeated labels are several objects: what was placed stays where it is.
         route: By which it must come to its place, as `GraspOutcome.route`; "": any.
         together: Both labels are requested simultaneously, of both arms.
+        graspable: Of objects of any shape by name: why a hand can't take it, as the judge decides; "" where it can.
     """
 
     set_name: str
@@ -75,6 +76,7 @@ class Task:
     clear: bool = False
     route: str = ""
     together: bool = False
+    graspable: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
 def within(ends: tuple[float, float], low: float, high: float) -> tuple[float, float]:
