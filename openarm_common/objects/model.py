@@ -152,7 +152,7 @@ def load_object(source: str) -> ObjectModel:
         names = ", ".join(object_names()) or "none"
         raise OpenArmError(
             Code.CONFIG_INVALID,
-            f"no object {brief(source)}: there is no {brief(str(folder / 'object.yaml'))}; objects: {names},"
+            f"no object {brief(source)}: there is no object.yaml in {str(folder)[:300]!r}; objects: {names},"
             f" {SUPERQUADRIC}SEED, or the path of a folder (with a /)",
         )
     return _read(source, folder, tuple(_stamp(folder / name) for name in _FILES))

@@ -50,6 +50,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "wilson_low": success["low"],
         "wilson_high": success["high"],
         "objects": interval(len(done), len(grasps)),
+        **_things(rows),
         "attempts": dict(sorted(Counter(int(row["attempts"]) for row in placed).items())),
         "causes": dict(Counter(_cause(row) for row in failed).most_common()),
         "kinds": _kinds(rows),
@@ -61,6 +62,31 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "place_error_mm": spread(grasp["place_error_mm"] for grasp in done),
         "cycle_s": spread(grasp["sim_s"] for grasp in done),
         "state_s": _states(done),
+    }
+
+
+def _things(rows: Sequence[Row]) -> dict[str, Any]:
+    """Sum up objects of any shape; empty without any.
+
+    `graspable` is the share that a hand can take at all, as the judge decides on the true meshes; `cleared` are those
+    of them that were placed, `of_object` the same by object; `refused` the codes of those that were not.
+    """
+    found = [(row, name, thing) for row in rows for name, thing in row.get("things", {}).items()]
+    if not found:
+        return {}
+    placed = {(id(row), g["target"]) for row in rows for g in row["grasps"] if g["placed"]}
+    can = [(row, name, thing) for row, name, thing in found if not thing["why_not"]]
+    by_object: dict[str, list[bool]] = defaultdict(list)
+    for row, name, thing in can:
+        by_object[Path(thing["object"]).name].append((id(row), name) in placed)
+    open_ = [g["code"] for row in rows if "things" in row for g in row["grasps"] if not g["placed"]]
+    seconds = sum(float(row["sim_s"]) for row in rows if "things" in row)
+    return {
+        "graspable": interval(len(can), len(found)),
+        "cleared": rate_of((id(row), name) in placed for row, name, _ in can),
+        "of_object": {name: rate_of(outcomes) for name, outcomes in sorted(by_object.items())},
+        "refused": dict(Counter(open_).most_common()),
+        "picks_per_hour": round(3600.0 * len(placed) / seconds) if seconds > 0.0 else None,
     }
 
 
@@ -115,6 +141,7 @@ def figures(data: Mapping[str, Any]) -> list[tuple[str, str]]:
     out += [
         ("false successes", f"{s['false_success']} (95 %: below {100 * s['false_success_high']:.2f} %)"),
         ("objects placed", _rate(s["objects"])),
+        *_figures_of_things(s),
         *((f"objects placed by the {arm} arm", _rate(rate)) for arm, rate in s["arms"].items()),
         *((f"placed with detector {kind}", _rate(rate)) for kind, rate in s["detectors"].items()),
         ("attempts: scenes", ", ".join(f"{k}: {v}" for k, v in s["attempts"].items()) or "none"),
@@ -129,6 +156,20 @@ def figures(data: Mapping[str, Any]) -> list[tuple[str, str]]:
     machine = data["machine"]
     out.append(("wall time", f"{data['wall_s']:.0f} s{speed}; {machine['cores']} cores, {machine['cpu']}"))
     return out
+
+
+def _figures_of_things(s: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The figures of objects of any shape; none without."""
+    if "graspable" not in s:
+        return []
+    missed = [f"{name} {v['n'] - v['count']} of {v['n']}" for name, v in s["of_object"].items() if v["count"] < v["n"]]
+    return [
+        ("graspable, as judged on the true meshes", _rate(s["graspable"])),
+        ("graspable ones placed", _rate(s["cleared"])),
+        ("graspable ones not placed", ", ".join(missed) or "none"),
+        ("answers where nothing was placed", ", ".join(f"{k}: {v}" for k, v in s["refused"].items()) or "none"),
+        ("objects placed in an hour of robot time", str(s["picks_per_hour"] or "none")),
+    ]
 
 
 def _rate(v: Mapping[str, Any]) -> str:

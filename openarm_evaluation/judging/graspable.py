@@ -32,7 +32,7 @@ from openarm_motion.service.motion_service import make_arms, table_box
 ROOM = 0.006
 #: Steepest tilt from straight down, and steps of tilt and of the direction of closing, rad.
 _TILTS = tuple(math.radians(tilt) for tilt in (0, 15, -15, 30, -30, 45, -45))
-_TURNS = 18
+_TURNS = 12
 #: Pitch of the voxels of an object, of places that are tried, and of depths, m.
 _PITCH, _PLACE, _DEPTH = 0.0025, 0.005, 0.006
 #: Tips above the table, m.

@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from openarm_interfaces.srv import MoveObject, RemoveObject, ResetWorld, SetPause, SpawnObject, StepSimulation
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.objects.posed import posed_object
 from openarm_common.ros.convert import pose_to_matrix, xyz
 from openarm_common.ros.node import BaseNode
 from openarm_common.scene.scene import Scene, load_scene
@@ -201,14 +202,19 @@ def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, An
     """Return the keys of a `SceneObject` from a request.
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, as `_pose_in_world`.
+        OpenArmError: INVALID_ARGUMENT, as `_pose_in_world`; of a mesh, as `posed_object`.
     """
-    T = _pose_in_world(request.pose, table_top_z, request.size.z)
+    if request.shape == "mesh":
+        own: dict[str, Any] = {"object": request.object, "side": request.side}
+        height = posed_object(request.object, request.side).size[2]
+    else:
+        own = {"size": tuple(xyz(request.size).tolist()), "color": request.color}
+        height = request.size.z
+    T = _pose_in_world(request.pose, table_top_z, height)
     return {
         "name": request.name,
         "shape": request.shape,
-        "size": tuple(xyz(request.size).tolist()),
-        "color": request.color,
+        **own,
         "mass": request.mass,
         "position": tuple(T[:3, 3].tolist()),
         "yaw": math.atan2(T[1, 0], T[0, 0]),

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Campaigns with objects of any shape: tasks, what a hand can grasp by the true mesh, judging, figures, options."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.objects.model import object_names
+from openarm_common.objects.posed import posed_object
+from openarm_common.objects.solid import Part, hull_part
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import robot_work
+from openarm_evaluation.campaign import report
+from openarm_evaluation.campaign.options import CampaignOptions
+from openarm_evaluation.campaign.tasks.suites import make_task
+from openarm_evaluation.campaign.tasks.things import REFUSED, object_sources
+from openarm_evaluation.campaign.trial import crashed_row
+from openarm_evaluation.judging.graspable import ROOM, Graspable, GraspJudge, HandShape
+from openarm_evaluation.judging.judge import RULES, Sample, fall_of, judge, rise_of
+from openarm_evaluation.judging.trial import choose_targets
+from openarm_evaluation.objects.household import HOUSEHOLD
+from openarm_evaluation.objects.make import make_objects
+
+TOP = robot_work().table.top_z
+
+
+def box(*edges: float) -> tuple[list[Part], float]:
+    part = hull_part(np.array(list(itertools.product(*[(-0.5 * edge, 0.5 * edge) for edge in edges]))))
+    assert part is not None
+    return [part], edges[2]
+
+
+def named(source: str, side: int = 0) -> tuple[list[Part], float]:
+    posed = posed_object(source, side)
+    return list(posed.parts), posed.size[2]
+
+
+def decide(thing: tuple[list[Part], float], x: float = 0.27, y: float = -0.2, yaw: float = 0.5) -> Graspable:
+    parts, height = thing
+    T = se3.make(se3.rot_z(yaw)[:3, :3], (x, y, TOP + 0.5 * height))
+    return GraspJudge.at(robot_work().table).decide(parts, T)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.5])
+def test_a_box_is_graspable_up_to_the_aperture_less_the_room(yaw) -> None:
+    opening = 2.0 * RobotDescription.load().hand("right").parts.opening
+    good = decide(box(0.06, 0.06, 0.06), yaw=yaw)
+    assert good.yes
+    assert good.width == pytest.approx(0.06, abs=0.006)
+    assert good.arm == "right"
+    assert decide(box(0.05, 0.05, 0.06), y=0.2, yaw=yaw).arm == "left"
+    assert decide(box(opening - ROOM - 0.002, 0.1, 0.05), yaw=yaw).yes
+
+
+def test_a_box_wider_than_the_aperture_less_the_room_is_not_graspable() -> None:
+    opening = 2.0 * RobotDescription.load().hand("right").parts.opening
+    assert not decide(box(opening - ROOM + 0.004, 0.1, 0.03)).yes
+
+
+def test_what_is_wide_in_every_direction_or_flat_on_the_table_is_not_graspable() -> None:
+    for thing in (box(0.1, 0.1, 0.1), box(0.15, 0.15, 0.008), box(0.03, 0.06, 0.004)):
+        found = decide(thing)
+        assert not found.yes
+        assert "no section that the hand can close on" in found.reason
+
+
+def test_long_things_are_graspable_by_a_part_of_them() -> None:
+    hammer = decide(named("hammer"))
+    assert hammer.yes
+    assert hammer.width < 0.06  # not its 114 mm
+    assert decide(named("mug", 2)).yes
+    assert decide(named("banana")).yes
+
+
+def test_what_is_far_away_is_out_of_reach() -> None:
+    found = decide(box(0.05, 0.05, 0.05), x=0.75, y=-0.55)
+    assert not found.yes
+    assert found.reason.startswith("out of reach")
+
+
+def test_the_grasp_of_the_judge_holds_the_object_between_the_pads_above_the_table() -> None:
+    found = decide(named("screwdriver"))
+    assert found.T_base_tcp is not None
+    R = found.T_base_tcp[:3, :3]
+    assert abs(R[2, 1]) < 1e-9  # it closes level
+    assert math.acos(-R[2, 2]) == pytest.approx(found.tilt, abs=1e-6)
+    assert found.tilt <= math.radians(45.0) + 1e-9
+    hand = HandShape.of(RobotDescription.load(), found.arm)
+    corners = np.array(
+        [box[[i, j, k], range(3)] for box in hand.boxes for i, j, k in itertools.product((0, 1), repeat=3)]
+    )
+    assert se3.apply(found.T_base_tcp, corners)[:, 2].min() >= TOP + 0.002
+
+
+def test_tasks_name_each_object_in_turn_and_are_the_same_each_time(tmp_path) -> None:
+    make_objects(tmp_path, ("egg", "wedge"))
+    tasks = [make_task("objects", seed, str(tmp_path)) for seed in range(4)]
+    assert [task.scene.objects[0].object.rsplit("/", 1)[1] for task in tasks] == ["egg", "wedge", "egg", "wedge"]
+    assert tasks == [make_task("objects", seed, str(tmp_path)) for seed in range(4)]
+    assert len({task.scene.appearance for task in tasks}) == 4
+    for task in tasks:
+        item = task.scene.objects[0]
+        assert task.labels == ("anything",)
+        assert [one.name for one in choose_targets(task.scene, "anything")] == ["thing"]
+        if task.graspable[item.name]:
+            assert task.codes == (Code.OK, *REFUSED)
+        else:
+            assert task.codes == (Code.OK,)
+
+
+def test_a_heap_lies_at_rest_on_the_table_and_all_of_it_is_requested(monkeypatch) -> None:
+    monkeypatch.setattr(GraspJudge, "decide", lambda self, parts, T: Graspable(True))
+    task = make_task("heap", 3, "superquadrics:40")
+    assert 3 <= len(task.scene.objects) <= 10
+    assert task.labels == ("anything",) * len(task.scene.objects)
+    assert task.clear
+    lowest = []
+    for item in task.scene.objects:
+        points = se3.apply(
+            item.T_world_object(task.scene.table), np.concatenate([p.vertices for p in item.posed.parts])
+        )
+        lowest.append(points[:, 2].min() - TOP)
+    assert min(lowest) > -0.002
+    assert min(lowest) < 0.002
+
+
+def test_sources_of_objects_are_read_or_refused(tmp_path) -> None:
+    assert object_sources("") == object_names()
+    assert object_sources("superquadrics:3") == ("superquadric:0", "superquadric:1", "superquadric:2")
+    for wrong, words in (("superquadrics:0", "N from 1"), (str(tmp_path), "no folder in it has an object.yaml")):
+        with pytest.raises(OpenArmError, match=words):
+            object_sources(wrong)
+    with pytest.raises(OpenArmError, match="of the suites objects, heap, not of 'nominal'"):
+        make_task("nominal", 0, "superquadrics:3")
+
+
+def test_set_without_a_value_is_the_suite_and_depth_finds_what_has_no_colour() -> None:
+    options = CampaignOptions(parameters=("objects", "grasp.attempts=2"), objects="superquadrics:5")
+    assert (options.set_name, options.parameters, options.finder) == ("objects", ("grasp.attempts=2",), "anything")
+    assert CampaignOptions().finder == "color"
+    assert "--suite objects" in options.command(3)
+    assert "--objects superquadrics:5" in options.command(3)
+    assert options.settings()["objects"] == "superquadrics:5"
+    with pytest.raises(OpenArmError, match="one suite at a time, got 'heap' and 'objects'"):
+        CampaignOptions(set_name="heap", parameters=("objects",))
+
+
+def sample(t_s: float, z: float, down: float = 0.0, tilt: float = 0.0) -> Sample:
+    q = np.array([math.sin(0.5 * tilt), 0.0, 0.0, math.cos(0.5 * tilt)])
+    return Sample(round(t_s * 1e9), np.array([0.3, 0.0, z]), q, np.array([0.0, 0.0, -down]), np.zeros(3))
+
+
+def lifted(*between: Sample, tilt: float = 0.0) -> list[Sample]:
+    return [sample(0.0, 0.42), sample(0.1, 0.55), *between, sample(1.0, 0.43, tilt=tilt), sample(1.6, 0.43, tilt=tilt)]
+
+
+def test_an_object_of_any_shape_may_rest_on_another_side_but_not_fall() -> None:
+    other = lifted(tilt=1.5)
+    assert judge(other, (0.3, 0.0), claimed=True, any_shape=True).placed
+    assert not judge(other, (0.3, 0.0), claimed=True).placed
+    falling = lifted(sample(0.2, 0.55), sample(0.25, 0.54, 0.49), sample(0.3, 0.50, 0.98), sample(0.32, 0.45))
+    assert fall_of(falling) == pytest.approx(0.049, abs=1e-3)
+    found = judge(falling, (0.3, 0.0), claimed=True, any_shape=True)
+    assert not found.placed
+    assert found.false_success
+    assert found.reasons == (f"fell: 49 mm freely, at most {1e3 * RULES.fall:.0f} are allowed",)
+    lowered = lifted(sample(0.2, 0.54, 0.2), sample(0.3, 0.52, 0.4), sample(0.4, 0.48, 0.5))
+    assert judge(lowered, (0.3, 0.0), claimed=True, any_shape=True).placed
+    assert rise_of(lowered) == pytest.approx(0.13)
+
+
+def test_figures_say_what_is_graspable_and_what_of_it_was_placed() -> None:
+    task = make_task("objects", 0, "superquadrics:1")
+    whys = ["", "", "no section"]
+    rows = []
+    for k, why in enumerate(whys):
+        row = crashed_row(task, RuntimeError("x")) | {"seed": k, "detector": "anything", "sim_s": 20.0}
+        row["things"] = {"thing": {"object": f"/a/object_{k}", "side": 0, "why_not": why}}
+        grasp = {"target": "thing", "placed": k == 0, "arm": "right", "code": "OK" if k == 0 else "TOO_WIDE"}
+        rows.append(row | {"grasps": [grasp | {"place_error_mm": 1.0, "sim_s": 20.0}]})
+    s = report.summarise(rows)
+    assert (s["graspable"]["count"], s["graspable"]["n"]) == (2, 3)
+    assert (s["cleared"]["count"], s["cleared"]["n"]) == (1, 2)
+    assert s["refused"] == {"TOO_WIDE": 2}
+    assert s["picks_per_hour"] == 60
+    told = dict(
+        report.figures(
+            {"summary": s, "asked": 3, "scenes_per_hour": None, "machine": {"cores": 1, "cpu": ""}, "wall_s": 1.0}
+        )
+    )
+    assert told["graspable, as judged on the true meshes"].startswith("2 of 3")
+    assert told["graspable ones not placed"] == "object_1 1 of 1"
+
+
+def test_the_folders_of_the_suite_are_those_that_are_made(tmp_path) -> None:
+    assert set(object_names()) == set(HOUSEHOLD)
+    (folder,) = make_objects(tmp_path, ("mug",))
+    made, kept = posed_object(str(folder)), posed_object("mug")
+    assert made.size == pytest.approx(kept.size, abs=1e-4)
+    assert len(made.parts) == len(kept.parts)
+    with pytest.raises(OpenArmError, match="no object 'nothing'; objects: apple"):
+        make_objects(tmp_path, ("nothing",))
