@@ -114,7 +114,11 @@ class CampaignOptions:
     @property
     def finder(self) -> DetectorKind:
         """What finds objects, where nothing is said: depth alone in suites of any shape."""
-        return self.detector or ("anything" if self.set_name in THINGS else "color")
+        return self.detector or self._usual_finder
+
+    @property
+    def _usual_finder(self) -> DetectorKind:
+        return "anything" if self.set_name in THINGS else "color"
 
     def settings(self) -> dict[str, Any]:
         """What must be the same for rows to belong together."""
@@ -165,6 +169,6 @@ class CampaignOptions:
             parts.append("" if self.identify else "--no-identify")
         parts.append("" if self.use_effort else "--no-effort")
         parts.append(f"--objects {shlex.quote(self.objects)}" if self.objects else "")
-        parts.append(f"--detector {self.detector}" if self.detector not in (None, "color") else "")
+        parts.append(f"--detector {self.finder}" if self.finder != self._usual_finder else "")
         parts += [f"--set {shlex.quote(item)}" for item in self.parameters]
         return " ".join(part for part in parts if part)

@@ -21,6 +21,7 @@ from openarm_evaluation.campaign.tasks import suites, two_arms
 from openarm_evaluation.campaign.tasks.faults import KINDS
 from openarm_evaluation.campaign.tasks.suites import SUITES, make_task
 from openarm_evaluation.campaign.tasks.task import Task
+from openarm_evaluation.campaign.tasks.things import THINGS
 
 #: Of the tasks of OpenArm v1, as figures in the docs have them.
 KNOWN = {
@@ -63,7 +64,7 @@ def test_an_object_to_push_is_drawn_where_it_has_always_been():
     def first(seed: int) -> str:
         return two_arms._one_object(seed, np.random.default_rng([seed, 5])).model_dump_json()
 
-    assert {*KNOWN, "push"} == set(SUITES)
+    assert {*KNOWN, "push", *THINGS} == set(SUITES)
     assert digest(first, 21) == "8b0596d64ece80df"
 
 

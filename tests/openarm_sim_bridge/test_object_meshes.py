@@ -30,8 +30,7 @@ def mesh(source: str, k: int = 0, **keys) -> dict:
 
 
 #: Things that differ: hollow, many parts, round, pointed, long.
-STILL = ("mug", "bowl", "egg", "pear", "screwdriver", "scissors", "star", "goblet", "superquadric:3", "superquadric:10",
-         "torus", "banana", "spray_bottle", "toy_car", "duck", "tape")  # fmt: skip
+STILL = ("mug", "egg", "pear", "screwdriver", "goblet", "superquadric:3", "torus", "spray_bottle", "duck")
 
 
 @pytest.mark.parametrize("other", [0, 1])
