@@ -18,8 +18,8 @@ from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.resources import write_whole
 from openarm_common.types import Array, Ints
 
-#: Concavity that a part may have, share of the mesh's size; most parts; seed of the search.
-_CONCAVITY, _PARTS, _SEED = 0.03, 48, 0
+#: Concavity that a part may have, share of the mesh's size; most parts; seed of the search, and its rounds a cut.
+_CONCAVITY, _PARTS, _SEED, _ROUNDS = 0.04, 32, 0, 60
 
 
 def cache_dir() -> Path:
@@ -28,7 +28,7 @@ def cache_dir() -> Path:
 
 
 def decomposed(vertices: Array, triangles: Ints, where: str) -> list[Array]:
-    """Return the corners (n, 3) of convex parts of a mesh, m: from the cache, else computed, which takes seconds.
+    """Return the corners (n, 3) of convex parts of a mesh, m: from the cache, else computed, which takes up to a minute.
 
     Args:
         vertices: (n, 3) m.
@@ -38,7 +38,7 @@ def decomposed(vertices: Array, triangles: Ints, where: str) -> list[Array]:
     Raises:
         OpenArmError: ENVIRONMENT, when `coacd` is needed and not installed; CONFIG_INVALID, when it finds no parts.
     """
-    key = hashlib.sha256(f"{_CONCAVITY} {_PARTS} {_SEED}".encode())
+    key = hashlib.sha256(f"{_CONCAVITY} {_PARTS} {_SEED} {_ROUNDS}".encode())
     key.update(np.ascontiguousarray(vertices).tobytes())
     key.update(np.ascontiguousarray(triangles).tobytes())
     path = cache_dir() / "convex_parts" / f"{key.hexdigest()[:32]}.npz"
@@ -55,7 +55,11 @@ def decomposed(vertices: Array, triangles: Ints, where: str) -> list[Array]:
     coacd.set_log_level("error")
     try:
         found = coacd.run_coacd(
-            coacd.Mesh(vertices, triangles), threshold=_CONCAVITY, max_convex_hull=_PARTS, seed=_SEED
+            coacd.Mesh(vertices, triangles),
+            threshold=_CONCAVITY,
+            max_convex_hull=_PARTS,
+            mcts_iterations=_ROUNDS,
+            seed=_SEED,
         )
     except (RuntimeError, ValueError) as error:
         raise OpenArmError(Code.CONFIG_INVALID, f"{where}: coacd finds no convex parts: {said(error)}") from error

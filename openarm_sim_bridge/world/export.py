@@ -54,7 +54,12 @@ def export(kind: Kind, scene: str | None = None, seed: int = 0) -> str:
         else:
             spec = build_spec(description, load_scene(scene, seed), load_cameras())
         spec.compile()
-        return spec.to_xml()
+        try:
+            return spec.to_xml()
+        except mujoco.FatalError as error:
+            text = f"MuJoCo can't write scene {scene!r} as XML: {error}"
+            hint = "objects with a texture and a scene with an appearance are for the simulation alone"
+            raise OpenArmError(Code.SCENE_INVALID, f"{text} {hint}") from error
     raise OpenArmError(Code.INVALID_ARGUMENT, f"unknown kind {kind!r}; kinds: urdf, mjcf, srdf")
 
 
