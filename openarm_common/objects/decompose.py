@@ -28,7 +28,7 @@ def cache_dir() -> Path:
 
 
 def decomposed(vertices: Array, triangles: Ints, where: str) -> list[Array]:
-    """Return the corners (n, 3) of convex parts of a mesh, m: from the cache, else computed, which takes up to a minute.
+    """Return the corners (n, 3) of convex parts of a mesh, m: from the cache, else computed within minutes.
 
     Args:
         vertices: (n, 3) m.
