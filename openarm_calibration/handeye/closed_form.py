@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from openarm_calibration.handeye.problem import Setup, inverses
+from openarm_calibration.handeye.problem import Setup
+from openarm_calibration.handeye.transforms import inverses
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array

@@ -3,177 +3,35 @@
 
 Each robot pose has a correction of six numbers (see `problem`) that costs `|d|²/translation² + |w|²/rotation²`, and is
 eliminated from the normal equations by its Schur complement. What remains is Gauss-Newton on the mounts (and extras),
-whose information matrix is at once the inverse covariance of the answer. The spread of the robot's errors, when not
-given, is that of the largest restricted likelihood: minus twice its logarithm, the criterion, is that of the residuals
-with the unknowns integrated out, so that their freedom is not counted as accuracy. m and rad.
+whose information matrix is at once the inverse covariance of the answer.
+
+Residuals of a view have two parts. What no pose of the board takes away is the noise of the marks, and counts with
+`px`. What a pose would take away contradicts the other views, and is shared by all marks of the view: bent boards,
+lenses and detectors do that as well as robots, so it counts with `px² (1 + misfit²)`. Spreads of robot and misfit, when
+not given, are those of the largest restricted likelihood (see `spread`); a misfit only where the data demand one. m
+and rad.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 
-from openarm_calibration.handeye.problem import Extra, Problem, chain, design, layout, moved
+from openarm_calibration.handeye.problem import Extra, Problem, chain, design, layout
+from openarm_calibration.handeye.spread import FLOOR, averaged, criterion, search
+from openarm_calibration.handeye.transforms import moved
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 
-#: Below these a robot counts as exact: far less than a mark moves by, and the arithmetic stays well conditioned.
-FLOOR = 1e-7  # m, rad
-#: Chance, before anything is seen, that the robot is exact; the factor within which others are like a typical one.
-_EXACT = 0.4
-_FACTOR = 3.0
-#: How much the logarithm of the likelihood counts: with five poses it is itself a matter of luck, and an answer that
-#: believes it fully is now and then far too sure.
-_TRUST = 0.7
-#: Where the average over spreads is taken: their size against a typical robot's, and translation against rotation.
-_LEVELS = np.geomspace(0.015, 30.0, 12)
-_BALANCES = np.geomspace(1.0 / 8.0, 8.0, 5)
-
-
-@njit(cache=True, nogil=True)
-def _cholesky(S: Array, L: Array) -> bool:  # pragma: no cover - compiled
-    n = len(S)
-    for i in range(n):
-        for j in range(i + 1):
-            total = S[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                L[i, i] = np.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    return True
-
-
-@njit(cache=True, nogil=True)
-def criterion(
-    full: Array, KMK: Array, both: Array, translation: float, rotation: float
-) -> float:  # pragma: no cover - compiled
-    """Return minus twice the log restricted likelihood, up to a constant; infinite where it does not exist.
-
-    Args:
-        full: (p + 1, p + 1) [[GMG, GMy], [GMyᵀ, yMy]].
-        KMK: (poses, 6, 6).
-        both: (poses, 6, p + 1) [KMG, KMy].
-        translation: Spread, m.
-        rotation: Spread, rad.
-    """
-    size = len(full)
-    left = full.copy()
-    V = np.empty((6, 6))
-    L = np.zeros((6, 6))
-    solved = np.empty((6, size))
-    t, r = translation**-2.0, rotation**-2.0
-    logs = -len(KMK) * 3.0 * (np.log(t) + np.log(r))
-    for g in range(len(KMK)):
-        for i in range(6):
-            for j in range(6):
-                V[i, j] = KMK[g, i, j]
-            V[i, i] += t if i < 3 else r
-        if not _cholesky(V, L):
-            return np.inf
-        for i in range(6):
-            logs += 2.0 * np.log(L[i, i])
-            for c in range(size):
-                total = both[g, i, c]
-                for k in range(i):
-                    total -= L[i, k] * solved[k, c]
-                solved[i, c] = total / L[i, i]
-        for a in range(size):
-            for b in range(a + 1):
-                total = 0.0
-                for k in range(6):
-                    total += solved[k, a] * solved[k, b]
-                left[a, b] -= total
-    # columns of metres, radians and pixels: scaled alike before the factorisation
-    scale = np.ones(size)
-    for a in range(size - 1):
-        scale[a] = 1.0 / np.sqrt(full[a, a]) if full[a, a] > 0.0 else 1.0
-    for a in range(size):
-        for b in range(a + 1):
-            left[a, b] *= scale[a] * scale[b]
-    root = np.zeros((size, size))
-    if not _cholesky(left, root):
-        return np.inf
-    for a in range(size - 1):
-        logs += 2.0 * np.log(root[a, a])
-    return logs + root[size - 1, size - 1] ** 2
-
-
-@njit(cache=True, nogil=True)
-def _search(
-    full: Array, KMK: Array, both: Array, start_t: float, start_r: float, whole: bool
-) -> tuple[float, float]:  # pragma: no cover - compiled
-    best_t, best_r = max(start_t, 1e-7), max(start_r, 1e-7)
-    best = criterion(full, KMK, both, best_t, best_r)
-    if whole:
-        for i in range(8):
-            for j in range(8):
-                t = 1e-7 if i == 0 else 4e-6 * 4.0 ** (i - 1)
-                r = 1e-7 if j == 0 else 8e-6 * 4.0 ** (j - 1)
-                value = criterion(full, KMK, both, t, r)
-                if value < best:
-                    best, best_t, best_r = value, t, r
-    span = 2.0 if whole else 1.2
-    for _ in range(40):
-        if span < 1.01:
-            break
-        better = False
-        around_t, around_r = best_t, best_r
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                if i == 0 and j == 0:
-                    continue
-                t = max(around_t * span**i, 1e-7)
-                r = max(around_r * span**j, 1e-7)
-                value = criterion(full, KMK, both, t, r)
-                if value < best:
-                    best, best_t, best_r, better = value, t, r, True
-        if not better:
-            span = span**0.5
-    return best_t, best_r
-
-
-@njit(cache=True, nogil=True)
-def _answers(
-    full: Array, KMK: Array, both: Array, spreads: Array, values: Array, answers: Array, covariances: Array
-) -> None:  # pragma: no cover - compiled
-    size = len(full) - 1
-    scale = np.empty(size)
-    for a in range(size):
-        scale[a] = 1.0 / np.sqrt(full[a, a]) if full[a, a] > 0.0 else 1.0
-    for k in range(len(spreads)):
-        values[k] = criterion(full, KMK, both, spreads[k, 0], spreads[k, 1])
-        if not np.isfinite(values[k]):
-            continue
-        left = full.copy()
-        for g in range(len(KMK)):
-            V = KMK[g].copy()
-            for i in range(6):
-                V[i, i] += spreads[k, 0 if i < 3 else 1] ** -2.0
-            left -= both[g].T @ np.linalg.solve(V, both[g])
-        H = left[:size, :size].copy()
-        for a in range(size):
-            for b in range(size):
-                H[a, b] *= scale[a] * scale[b]
-        C = np.linalg.inv(H)
-        for a in range(size):
-            for b in range(size):
-                covariances[k, a, b] = C[a, b] * scale[a] * scale[b]
-        answers[k] = covariances[k] @ np.ascontiguousarray(left[:size, size])
-
-
 _LOWEST_PX = 1e-3
-#: Errors of a small arm, m and rad: only the centre of a wide prior.
-TYPICAL_ROBOT = (4e-4, 8e-4)
 _ITERATIONS = 30
+#: Drop of minus twice the log likelihood from which a misfit is accepted: one clean set in two hundred has it.
+_EVIDENT = 6.6
+_MISFITS = tuple(2.0**k for k in range(-1, 10))
 
 
 @dataclass(frozen=True)
@@ -184,16 +42,79 @@ class Noise:
         px: Of a detected mark, pixels.
         translation: Of the robot's pose, m; 0 is an exact robot.
         rotation: Of the robot's pose, rad.
+        misfit: Of what the marks of a view have in common, over what `px` makes of it; 0 without.
     """
 
     px: float
     translation: float = 0.0
     rotation: float = 0.0
+    misfit: float = 0.0
 
     @property
     def prior(self) -> Array:
         """(6, 6) inverse covariance of a correction of A."""
         return np.diag(np.repeat(np.maximum((self.translation, self.rotation), FLOOR), 3) ** -2.0)
+
+    @property
+    def view_px(self) -> float:
+        """Standard deviation that counts where views are compared, px by mark."""
+        return self.px * math.sqrt(1.0 + self.misfit**2)
+
+    def misfit_px(self, marks: float) -> float:
+        """Return the rms of the misfit at `marks` marks of a view, px by axis."""
+        return self.px * self.misfit * math.sqrt(3.0 / max(marks, 3.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """What is known of the extras before anything is seen: standard deviations, infinite where nothing is.
+
+    Args:
+        scale: Of the board.
+        delay: Of the images, s.
+        focal: Of fx and fy, as a fraction.
+        centre: Of cx and cy, px.
+        distortion: Of k1 and of k2.
+        zeros: (joints,) of the offsets, rad; None: infinite.
+        zeros_at: (joints,) where the offsets are expected, rad.
+    """
+
+    scale: float = math.inf
+    delay: float = math.inf
+    focal: float = math.inf
+    centre: float = math.inf
+    distortion: float = math.inf
+    zeros: Array | None = None
+    zeros_at: Array | None = None
+
+    def of(self, problem: Problem, extras: Sequence[Extra]) -> tuple[Array, Array]:
+        """Return the deviations and expected values (parameters,) of all columns; mounts are free.
+
+        Args:
+            problem: The views.
+            extras: Which unknowns there are besides the mounts.
+        """
+        columns = layout(problem, extras)
+        size = max(part.stop for part in columns.values())
+        sigma, expected = np.full(size, math.inf), np.zeros(size)
+        rows = problem.intrinsics_rows
+        for name, part in columns.items():
+            if name == "scale":
+                sigma[part], expected[part] = self.scale, 1.0
+            elif name == "delay":
+                sigma[part] = self.delay
+            elif name == "intrinsics":
+                centre = np.full((problem.cameras, 2), self.centre)
+                sigma[part] = np.concatenate([rows[:, :2] * self.focal, centre], axis=1).ravel()
+            elif name == "distortion":
+                sigma[part] = self.distortion
+            elif name == "zeros":
+                sigma[part] = math.inf if self.zeros is None else np.maximum(self.zeros, FLOOR)
+                expected[part] = 0.0 if self.zeros_at is None else self.zeros_at
+        return sigma, expected
+
+
+FREE = Priors()
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,6 +128,8 @@ class State:
         intrinsics: (cameras, 4) changes of fx, fy, cx, cy, px.
         scale: Of the board.
         delay: Of the images, s.
+        distortion: (cameras, 2) k1, k2.
+        zeros: (joints,) offsets of the joints from where `View.A` has them, rad.
     """
 
     X: Array
@@ -215,11 +138,31 @@ class State:
     intrinsics: Array
     scale: float = 1.0
     delay: float = 0.0
+    distortion: Array = field(default_factory=lambda: np.zeros((1, 2)))
+    zeros: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def start(cls, problem: Problem, X: Array, Z: Array) -> State:
         """Return mounts with nothing corrected."""
-        return cls(X, Z, np.zeros((int(problem.pose.max()) + 1, 6)), np.zeros((problem.cameras, 4)))
+        cameras = problem.cameras
+        return cls(
+            X, Z, np.zeros((int(problem.pose.max()) + 1, 6)), np.zeros((cameras, 4)),
+            distortion=np.zeros((cameras, 2)), zeros=np.zeros(problem.joints),
+        )  # fmt: skip
+
+    @property
+    def optics(self) -> Array:
+        """(cameras, 6) changes of fx, fy, cx, cy, k1, k2."""
+        return np.concatenate([self.intrinsics, self.distortion], axis=1)
+
+    def at_poses(self, problem: Problem) -> Array | None:
+        """(n, 6) changes of A by delay and zeros; None without any."""
+        change = np.zeros((len(problem), 6))
+        if self.delay:
+            change -= self.delay * problem.rate
+        if self.zeros.any():
+            change += problem.by_joints @ self.zeros
+        return change if change.any() else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -231,12 +174,15 @@ class Estimate(State):
         information: (parameters, parameters), columns as `problem.design`.
         extras: Which of the unknowns besides the mounts were free.
         spread: (parameters, parameters) covariance where the robot's spread was estimated.
+        evidence: Minus twice the log marginal likelihood; comparable between answers for the same pixels whose extras
+            have finite priors.
     """
 
     noise: Noise
     information: Array
     extras: tuple[Extra, ...] = ()
     spread: Array | None = None
+    evidence: float = math.nan
 
     def covariance(self) -> Array:
         """(parameters, parameters) of the unknowns; with an estimated robot it counts the doubt about its spread too.
@@ -249,80 +195,126 @@ class Estimate(State):
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """The problem linearised: sums over the robot poses, with the corrections not yet eliminated.
+    """The problem linearised, in px²: sums over the robot poses, with the corrections not yet eliminated.
 
-    `y` is the residual of the views with all corrections taken out, seen as a twist; `M` weighs it.
+    `within` is of the part of the residuals that no pose of a board takes away, `twist` of the rest. `y` is the residual
+    with all corrections taken out.
     """
 
-    full: Array  # (p + 1, p + 1) [[GMG, GMy], [GMyᵀ, yMy]]
+    within: Array  # (p + 1, p + 1) [[GMG, GMy], [GMyᵀ, yMy]]
+    twist: Array  # (p + 1, p + 1)
+    prior: Array  # (p + 1, p + 1), without unit
     KMK: Array  # (poses, 6, 6)
     both: Array  # (poses, 6, p + 1) [KMG, KMy]
-    cost: float  # of the views alone, in units of the pixel noise
+    within_cost: Array  # (n,) of each view, px²
+    twist_cost: float  # of all views, px²
+
+    def weighed(self, noise: Noise) -> tuple[Array, Array, Array]:
+        """Return `full` (p + 1, p + 1), KMK and `both` in units of the noise."""
+        twist = noise.view_px**-2.0
+        return self.within * noise.px**-2.0 + self.twist * twist + self.prior, self.KMK * twist, self.both * twist
+
+    def cost(self, noise: Noise) -> float:
+        """Return the cost of the residuals and of the priors, in units of the noise."""
+        return float(
+            self.within_cost.sum() * noise.px**-2.0 + self.twist_cost * noise.view_px**-2.0 + self.prior[-1, -1]
+        )
 
 
-def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]) -> Linear:
+def linearise(problem: Problem, state: State, extras: Sequence[Extra], priors: Priors = FREE) -> Linear:
     """Return the normal equations at a state.
 
     Args:
         problem: The views.
         state: The unknowns.
-        px: Spread of a mark, px.
         extras: More unknowns.
+        priors: Of these.
     """
     correction = state.correction[problem.pose]
-    shifted = correction - state.delay * problem.rate if state.delay else correction
-    T, B = chain(problem, state.X, state.Z, shifted)
-    squares, slopes, costs = problem.equations(T, state.intrinsics, state.scale)
-    weight = px**-2.0
-    M, b = squares * weight, slopes * weight
+    shift = state.at_poses(problem)
+    T, B = chain(problem, state.X, state.Z, correction if shift is None else correction + shift)
+    M, b, costs = problem.equations(T, state.optics, state.scale)
     G, K = design(problem, state.X, state.Z, T, B, extras)
     K = np.where((problem.kind == 2)[:, None, None], 0.0, K)
+    size = G.shape[2]
+    own, across, slope = M[:, :6, :6], M[:, :6, 6:], b[:, :6]
+    if not np.isfinite(costs).all():
+        poses, empty = int(problem.pose.max()) + 1, np.zeros((size + 1, size + 1))
+        return Linear(
+            empty, empty, empty, np.zeros((poses, 6, 6)), np.zeros((poses, 6, size + 1)), costs, math.inf,
+        )  # fmt: skip
+    solved = np.linalg.solve(own, np.concatenate([across, slope[:, :, None]], axis=2))
+    taken = np.einsum("ni,ni->n", slope, solved[:, :, -1])
+    within_cost = np.maximum(costs - taken, 0.0)
+    within = np.zeros((size + 1, size + 1))
+    within[-1, -1] = within_cost.sum()
+    beyond = G[:, 6:]
+    if beyond.any():
+        inside = M[:, 6:, 6:] - across.swapaxes(1, 2) @ solved[:, :, :-1]
+        right = b[:, 6:] - (across.swapaxes(1, 2) @ solved[:, :, -1:])[:, :, 0]
+        within[:-1, :-1] = np.einsum("nip,niq->pq", beyond, inside @ beyond, optimize=False)
+        within[:-1, -1] = within[-1, :-1] = np.einsum("nip,ni->p", beyond, right)
     Mk = M[:, :, :6] @ K
     My = b + (Mk @ correction[:, :, None])[:, :, 0]
     poses = int(problem.pose.max()) + 1
     Kt = K.swapaxes(1, 2)
-    KMK, both = np.zeros((poses, 6, 6)), np.zeros((poses, 6, G.shape[2] + 1))
+    KMK, both = np.zeros((poses, 6, 6)), np.zeros((poses, 6, size + 1))
     np.add.at(KMK, problem.pose, Kt @ Mk[:, :6])
     np.add.at(both, problem.pose, np.concatenate([Mk.swapaxes(1, 2) @ G, Kt @ My[:, :6, None]], axis=2))
     GMG = np.einsum("nip,niq->pq", G, M @ G, optimize=False)
     GMy = np.einsum("nip,ni->p", G, My)
     Kd = (K @ correction[:, :, None])[:, :, 0]
     # b = M y - M K d, and |r|² changes by the same quadratic, so yMy follows from the residual at d
-    cost = float(costs.sum() * weight)
-    yMy = cost + float(np.sum(Kd * (2.0 * b[:, :6] + (M[:, :6, :6] @ Kd[:, :, None])[:, :, 0])))
-    full = np.block([[GMG, GMy[:, None]], [GMy[None, :], np.array([[yMy]])]])
-    return Linear(full, KMK, both, cost)
+    yMy = costs.sum() + float(np.sum(Kd * (2.0 * slope + (own @ Kd[:, :, None])[:, :, 0])))
+    whole = np.block([[GMG, GMy[:, None]], [GMy[None, :], np.array([[yMy]])]])
+    sigma, expected = priors.of(problem, extras)
+    weight = sigma**-2.0
+    left = expected - values(problem, state, extras)
+    prior = np.diag(np.append(weight, np.sum(weight * left**2)))
+    prior[:-1, -1] = prior[-1, :-1] = weight * left
+    return Linear(within, whole - within, prior, KMK, both, within_cost, float((costs - within_cost).sum()))
 
 
-def eliminate(linear: Linear, prior: Array) -> tuple[Array, Array, Array]:
-    """Return the information (p, p), right-hand side (p,), and (poses, 6, 6) inverse of the corrections' block."""
-    V: Array = np.linalg.inv(linear.KMK + prior).astype(np.float64)
-    reduced = linear.full - np.einsum("gip,giq->pq", linear.both, V @ linear.both)
-    information = reduced[:-1, :-1]
-    return (information + information.T) / 2.0, reduced[:-1, -1], V
+def values(problem: Problem, state: State, extras: Sequence[Extra]) -> Array:
+    """Return the extras of a state (parameters,), in the columns of `layout`; 0 in those of the mounts.
 
-
-def averaged(linear: Linear) -> Array:
-    """Return the covariance (p, p) about the present answer, averaged over the spreads that the data allow.
-
-    With few poses the spread itself is uncertain, and an answer that takes its best value for true is too sure of
-    itself. The weight is the restricted likelihood times a prior: either the robot is exact, as in a simulation, or
-    its spread is near that of a typical one, with translation and rotation more or less in proportion.
+    Args:
+        problem: The views.
+        state: The unknowns.
+        extras: Which ones.
     """
-    level, balance = (grid.ravel() for grid in np.meshgrid(_LEVELS, _BALANCES, indexing="ij"))
-    spreads = np.stack(
-        [level * np.sqrt(balance) * TYPICAL_ROBOT[0], level / np.sqrt(balance) * TYPICAL_ROBOT[1]], axis=1
+    columns = layout(problem, extras)
+    out = np.zeros(max(part.stop for part in columns.values()))
+    for extra in extras:
+        out[columns[extra]] = np.ravel(getattr(state, extra))
+    return out
+
+
+def eliminate(linear: Linear, noise: Noise) -> tuple[Array, Array, Array, Array]:
+    """Return the information (p, p), right-hand side (p,), (poses, 6, 6) inverse of the corrections' block, `both`."""
+    full, KMK, both = linear.weighed(noise)
+    V: Array = np.linalg.inv(KMK + noise.prior).astype(np.float64)
+    reduced = full - np.einsum("gip,giq->pq", both, V @ both)
+    information = reduced[:-1, :-1]
+    return (information + information.T) / 2.0, reduced[:-1, -1], V, both
+
+
+def evidence(problem: Problem, linear: Linear, noise: Noise, extras: Sequence[Extra], priors: Priors) -> float:
+    """Return minus twice the log marginal likelihood of the pixels, up to a constant that is the same for all answers.
+
+    Args:
+        problem: The views.
+        linear: At the answer.
+        noise: Standard deviations.
+        extras: That are free.
+        priors: Of these; a constant is missing where one is infinite.
+    """
+    value = criterion(*linear.weighed(noise), max(noise.translation, FLOOR), max(noise.rotation, FLOOR))
+    own = 2.0 * math.log(noise.px) * float(np.sum(2 * problem.marks - 6))
+    sigma, _ = priors.of(problem, extras)
+    return value + own + 12.0 * len(problem) * math.log(noise.view_px) + 2.0 * float(
+        np.log(sigma[np.isfinite(sigma)]).sum()
     )
-    spreads = np.concatenate([[[FLOOR, FLOOR]], spreads])
-    near = np.exp(-0.5 * (np.log(level) ** 2 + np.log(balance) ** 2) / math.log(_FACTOR) ** 2)
-    prior = np.concatenate([[_EXACT], (1.0 - _EXACT) * near / near.sum()])
-    size, count = len(linear.full) - 1, len(spreads)
-    values, answers, covariances = np.full(count, np.inf), np.zeros((count, size)), np.zeros((count, size, size))
-    _answers(linear.full, linear.KMK, linear.both, spreads, values, answers, covariances)
-    weight = prior * np.exp(-0.5 * _TRUST * (values - np.min(values)))
-    weight[~np.isfinite(values)] = 0.0
-    weight /= weight.sum()
-    return np.einsum("k,kpq->pq", weight, covariances) + np.einsum("k,kp,kq->pq", weight, answers, answers)
 
 
 def refine(
@@ -332,7 +324,9 @@ def refine(
     noise: Noise,
     *,
     extras: Sequence[Extra] = (),
+    priors: Priors = FREE,
     estimate_robot: bool = False,
+    estimate_px: bool = False,
     iterations: int = _ITERATIONS,
 ) -> Estimate:
     """Refine mounts to the maximum of the likelihood.
@@ -342,37 +336,40 @@ def refine(
         X: (cameras, 4, 4) to start from.
         Z: (boards, 4, 4) to start from.
         noise: Standard deviations; those of the robot are a starting point when they are to be estimated.
-        extras: More unknowns: scale, delay, intrinsics.
-        estimate_robot: Whether the spread of the robot's errors is found from the data.
+        extras: More unknowns: scale, delay, intrinsics, distortion, zeros.
+        priors: Of these.
+        estimate_robot: Whether the spreads of the robot's errors and of the misfit are found from the data.
+        estimate_px: Whether that of the marks follows the extras.
         iterations: At most.
 
     Raises:
         OpenArmError: INTERNAL, when the start is no description of the views (a mark behind the camera).
     """
     state = State.start(problem, X, Z)
-    linear = linearise(problem, state, noise.px, extras)
-    if not np.isfinite(linear.cost):
+    linear = linearise(problem, state, extras, priors)
+    if not np.isfinite(linear.twist_cost):
         raise OpenArmError(
             Code.INTERNAL, "the refinement starts with a mark behind the camera; the closed form it came from is wrong"
         )
-    damping, settled = 0.0, 0
+    damping, settled, tried = 0.0, 0, False
     for count in range(iterations):
+        if estimate_px and count >= 2:
+            noise = replace(noise, px=_pooled(problem, linear.within_cost))
         if estimate_robot and count >= 2 and settled < 4:
-            spreads = _search(linear.full, linear.KMK, linear.both, noise.translation, noise.rotation, count == 2)
-            found = Noise(noise.px, *spreads)
+            spreads = search(*linear.weighed(noise), noise.translation, noise.rotation, count == 2)
+            found = replace(noise, translation=spreads[0], rotation=spreads[1])
             settled = settled + 1 if _near(found, noise) else 0
             noise = found
-        prior = noise.prior
-        cost = linear.cost + _prior_cost(state.correction, prior)
+        cost = linear.cost(noise) + _prior_cost(state.correction, noise.prior)
         while True:
-            information, right, V = eliminate(linear, prior)
+            information, right, V, both = eliminate(linear, noise)
             scale = np.sqrt(np.maximum(np.diag(information), 1e-30))
             normed = information / np.outer(scale, scale) + damping * np.eye(len(scale))
             step = np.linalg.lstsq(normed, right / scale, rcond=1e-14)[0] / scale
-            correction = (V @ (linear.both @ np.append(-step, 1.0))[:, :, None])[:, :, 0]
+            correction = (V @ (both @ np.append(-step, 1.0))[:, :, None])[:, :, 0]
             trial = _stepped(problem, state, step, correction, extras)
-            ahead = linearise(problem, trial, noise.px, extras)
-            reached = ahead.cost + _prior_cost(correction, prior)
+            ahead = linearise(problem, trial, extras, priors)
+            reached = ahead.cost(noise) + _prior_cost(correction, noise.prior)
             if reached <= cost * (1.0 + 1e-9) + 1e-9 or damping > 1e3:
                 break
             damping = max(10.0 * damping, 1e-4)
@@ -382,10 +379,44 @@ def refine(
         damping = damping * 0.1 if damping > 1e-6 else 0.0
         small = float(np.abs(step[: 6 * (problem.cameras + problem.boards)]).max()) < 1e-9
         if (small or cost - reached < 1e-9 * max(reached, 1.0)) and (not estimate_robot or settled >= 1):
-            break
-    spread = averaged(linear) if estimate_robot else None
-    information, _, _ = eliminate(linear, noise.prior)
-    return Estimate(**vars(state), noise=noise, information=information, extras=tuple(extras), spread=spread)
+            if tried or not estimate_robot:
+                break
+            found, tried = _with_misfit(linear, noise), True
+            if found == noise:
+                break
+            noise, settled = found, 0
+    spread = averaged(*linear.weighed(noise)) if estimate_robot else None
+    information, _, _, _ = eliminate(linear, noise)
+    known = evidence(problem, linear, noise, extras, priors)
+    return Estimate(
+        **vars(state), noise=noise, information=information, extras=tuple(extras), spread=spread, evidence=known
+    )
+
+
+def _with_misfit(linear: Linear, noise: Noise) -> Noise:
+    """Return the noise with the most likely misfit, where that is far more likely than none."""
+    views = len(linear.within_cost)
+
+    def value(at: Noise) -> float:
+        level = 12.0 * views * math.log(at.view_px)
+        return level + criterion(*linear.weighed(at), max(at.translation, FLOOR), max(at.rotation, FLOOR))
+
+    best, lowest, first = noise, value(noise), value(noise)
+    around, grid = replace(noise), _MISFITS
+    for _ in range(3):
+        for misfit in grid:
+            trial = replace(around, misfit=misfit)
+            for start in ((trial.translation, trial.rotation), (FLOOR, FLOOR)):
+                spreads = search(*linear.weighed(trial), *start, False)
+                at = replace(trial, translation=spreads[0], rotation=spreads[1])
+                reached = value(at)
+                if reached < lowest:
+                    best, lowest = at, reached
+        if best is noise:
+            return noise
+        around = best
+        grid = tuple(best.misfit * f for f in ((0.7, 1.4) if len(grid) > 2 else (0.85, 1.2)))
+    return best if first - lowest > _EVIDENT else noise
 
 
 def information_at(problem: Problem, X: Array, Z: Array, noise: Noise) -> Array:
@@ -397,7 +428,7 @@ def information_at(problem: Problem, X: Array, Z: Array, noise: Noise) -> Array:
         Z: (boards, 4, 4).
         noise: Standard deviations.
     """
-    return eliminate(linearise(problem, State.start(problem, X, Z), noise.px, ()), noise.prior)[0]
+    return eliminate(linearise(problem, State.start(problem, X, Z), ()), noise)[0]
 
 
 def _stepped(problem: Problem, state: State, step: Array, correction: Array, extras: Sequence[Extra]) -> State:
@@ -424,13 +455,18 @@ def pixel_noise(problem: Problem) -> float:
 
     Views whose own fit is far worse than the usual one are left out.
     """
+    return _pooled(problem, problem.free_cost)
+
+
+def _pooled(problem: Problem, cost: Array) -> float:
+    """Return the spread of the marks, px by axis, from what no pose takes away (n,), px²."""
     freedom = 2.0 * problem.marks - 6.0
     usable = freedom > 0
     if not usable.any():
         return 0.3
-    variance = problem.free_cost[usable] / freedom[usable]
+    variance = cost[usable] / freedom[usable]
     good = variance <= 6.0 * np.median(variance)
-    pooled = problem.free_cost[usable][good].sum() / freedom[usable][good].sum()
+    pooled = cost[usable][good].sum() / freedom[usable][good].sum()
     return max(float(np.sqrt(pooled)), _LOWEST_PX)
 
 

@@ -65,15 +65,15 @@ def pose_tests(problem: Problem, used: Mask, estimate: Estimate, limit: float, u
         By number of the pose, as `problem.pose` counts.
     """
     T, B = chain(problem, estimate.X, estimate.Z)
-    squares, _, _ = problem.equations(problem.free, estimate.intrinsics, estimate.scale)
-    M = squares[:, :6, :6] * estimate.noise.px**-2.0
+    squares, _, _ = problem.equations(problem.free, estimate.optics, estimate.scale)
+    M = squares[:, :6, :6] * estimate.noise.view_px**-2.0
     G, K = design(problem, estimate.X, estimate.Z, T, B, estimate.extras)
     extra = 6 * (problem.cameras + problem.boards)
     # extras act in addition to the twist; their effect on it is what a view's own fit would make of them
     G6 = G[:, :6].copy()
     M[~usable] = np.eye(6)
     if estimate.extras:
-        through = np.linalg.solve(M, squares[:, :6, 6:] * estimate.noise.px**-2.0)
+        through = np.linalg.solve(M, squares[:, :6, 6:] * estimate.noise.view_px**-2.0)
         G6[:, :, extra:] += through @ G[:, 6:, extra:]
     y = np.array([_twist(T[i], problem.free[i]) for i in range(len(problem))])
     robot = np.linalg.inv(estimate.noise.prior)

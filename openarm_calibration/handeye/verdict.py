@@ -96,7 +96,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
         )  # fmt: skip
         left = problem.subset(used[out])
         T, _ = chain(left, estimate.X, estimate.Z)
-        rows = left.camera_rows(estimate.intrinsics)
+        rows = left.camera_rows(estimate.optics)
         for k, view in enumerate(left.views):
             away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
             px = float(np.mean(np.sum(away**2, axis=1)))

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from openarm_calibration.handeye.problem import exps
+from openarm_calibration.handeye.transforms import exps
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 

@@ -29,7 +29,8 @@ from pydantic import Field, field_validator
 
 from openarm_calibration.board.board import Board, parse_board
 from openarm_calibration.board.detect import BoardDetection, guess_pose
-from openarm_calibration.handeye.problem import Problem, View, assemble, difference
+from openarm_calibration.handeye.problem import Problem, View, assemble
+from openarm_calibration.handeye.transforms import difference
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config, validate

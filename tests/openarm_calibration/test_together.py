@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from openarm_calibration.handeye.offline import calibrate, calibrate_together, join
-from openarm_calibration.handeye.problem import moved
+from openarm_calibration.handeye.transforms import moved
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig
 from openarm_calibration.sampling.samples import SampleSet
