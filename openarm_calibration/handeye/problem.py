@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,19 @@ Extra = Literal["scale", "delay", "intrinsics", "distortion", "zeros"]
 EXTRAS: tuple[Extra, ...] = ("scale", "delay", "intrinsics", "distortion", "zeros")
 
 
+class Arm(Protocol):
+    """Joint positions behind a robot pose."""
+
+    @property
+    def count(self) -> int:
+        """Number of offsets."""
+        ...
+
+    def at(self, zeros: Array) -> tuple[Array, Array]:
+        """Return A (4, 4) at offsets (count,) of the zeros, and how it changes with each (6, count)."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """One board in one image.
@@ -53,7 +66,7 @@ class View:
         pose: Number of the robot pose; views of the same one share its error.
         name: What the view is called in reports.
         rate: (6,) how fast A changes, in its own six numbers a second; zero at rest.
-        by_joints: (6, joints) how A changes with the offset of each joint's zero; the same joints in all views.
+        arm: The joints that A comes from, the same in all views; None where A alone is known.
     """
 
     points: Array
@@ -66,7 +79,7 @@ class View:
     pose: int = 0
     name: str = ""
     rate: Array = field(default_factory=lambda: np.zeros(6))
-    by_joints: Array = field(default_factory=lambda: np.zeros((6, 0)))
+    arm: Arm | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +100,7 @@ class Problem:
     board: Indices
     pose: Indices
     rate: Array
-    by_joints: Array  # (n, 6, joints)
+    by_joints: Array  # (n, 6, joints) how A changes with the zeros; see `posed`
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -106,7 +119,7 @@ class Problem:
     @property
     def joints(self) -> int:
         """Number of joints whose zeros may be unknowns."""
-        return int(self.by_joints.shape[2])
+        return 0 if self.views[0].arm is None else self.views[0].arm.count
 
     @property
     def marks(self) -> Indices:
@@ -132,6 +145,13 @@ class Problem:
         chosen = np.arange(len(self))[np.asarray(keep)]
         views = tuple(self.views[i] for i in chosen)
         return _pack(views, self.intrinsics, self.free[chosen], self.free_cost[chosen])
+
+    def posed(self, zeros: Array) -> Problem:
+        """Return the same views with the robot poses that follow from the joints, at offsets (joints,) of their zeros."""
+        found = [view.arm.at(zeros) for view in self.views if view.arm is not None]
+        if len(found) < len(self):
+            return self
+        return replace(self, A=np.array([A for A, _ in found]), by_joints=np.array([by for _, by in found]))
 
 
 def assemble(views: Sequence[View], intrinsics: Sequence[Intrinsics], guesses: Sequence[Array]) -> Problem:
@@ -164,7 +184,7 @@ def _pack(views: tuple[View, ...], intrinsics: tuple[Intrinsics, ...], free: Arr
         board=np.array([view.board for view in views], dtype=np.int64),
         pose=np.asarray(pose, dtype=np.int64).reshape(-1),
         rate=np.array([view.rate for view in views], dtype=np.float64),
-        by_joints=np.array([view.by_joints for view in views], dtype=np.float64),
+        by_joints=np.zeros((len(views), 6, 0)),
     )
 
 

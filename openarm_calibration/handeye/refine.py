@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from openarm_calibration.handeye.problem import Extra, Problem, chain, design, layout
-from openarm_calibration.handeye.spread import FLOOR, averaged, criterion, search
+from openarm_calibration.handeye.spread import FLOOR, averaged, criterion, search, search_misfit
 from openarm_calibration.handeye.transforms import moved
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
@@ -31,7 +31,6 @@ _LOWEST_PX = 1e-3
 _ITERATIONS = 30
 #: Drop of minus twice the log likelihood from which a misfit is accepted: one clean set in two hundred has it.
 _EVIDENT = 6.6
-_MISFITS = tuple(2.0**k for k in range(-1, 10))
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,6 @@ class Priors:
         centre: Of cx and cy, px.
         distortion: Of k1 and of k2.
         zeros: (joints,) of the offsets, rad; None: infinite.
-        zeros_at: (joints,) where the offsets are expected, rad.
     """
 
     scale: float = math.inf
@@ -85,7 +83,6 @@ class Priors:
     centre: float = math.inf
     distortion: float = math.inf
     zeros: Array | None = None
-    zeros_at: Array | None = None
 
     def of(self, problem: Problem, extras: Sequence[Extra]) -> tuple[Array, Array]:
         """Return the deviations and expected values (parameters,) of all columns; mounts are free.
@@ -110,7 +107,6 @@ class Priors:
                 sigma[part] = self.distortion
             elif name == "zeros":
                 sigma[part] = math.inf if self.zeros is None else np.maximum(self.zeros, FLOOR)
-                expected[part] = 0.0 if self.zeros_at is None else self.zeros_at
         return sigma, expected
 
 
@@ -129,7 +125,7 @@ class State:
         scale: Of the board.
         delay: Of the images, s.
         distortion: (cameras, 2) k1, k2.
-        zeros: (joints,) offsets of the joints from where `View.A` has them, rad.
+        zeros: (joints,) offsets of the joints; without them A is that of the view, rad.
     """
 
     X: Array
@@ -156,13 +152,8 @@ class State:
         return np.concatenate([self.intrinsics, self.distortion], axis=1)
 
     def at_poses(self, problem: Problem) -> Array | None:
-        """(n, 6) changes of A by delay and zeros; None without any."""
-        change = np.zeros((len(problem), 6))
-        if self.delay:
-            change -= self.delay * problem.rate
-        if self.zeros.any():
-            change += problem.by_joints @ self.zeros
-        return change if change.any() else None
+        """(n, 6) changes of A by the delay; None without any."""
+        return -self.delay * problem.rate if self.delay else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -230,6 +221,8 @@ def linearise(problem: Problem, state: State, extras: Sequence[Extra], priors: P
         extras: More unknowns.
         priors: Of these.
     """
+    if "zeros" in extras:
+        problem = problem.posed(state.zeros)
     correction = state.correction[problem.pose]
     shift = state.at_poses(problem)
     T, B = chain(problem, state.X, state.Z, correction if shift is None else correction + shift)
@@ -323,10 +316,12 @@ def refine(
     Z: Array,
     noise: Noise,
     *,
+    zeros: Array | None = None,
     extras: Sequence[Extra] = (),
     priors: Priors = FREE,
     estimate_robot: bool = False,
     estimate_px: bool = False,
+    estimate_misfit: bool = True,
     iterations: int = _ITERATIONS,
 ) -> Estimate:
     """Refine mounts to the maximum of the likelihood.
@@ -336,16 +331,20 @@ def refine(
         X: (cameras, 4, 4) to start from.
         Z: (boards, 4, 4) to start from.
         noise: Standard deviations; those of the robot are a starting point when they are to be estimated.
+        zeros: (joints,) to start from; None: 0.
         extras: More unknowns: scale, delay, intrinsics, distortion, zeros.
         priors: Of these.
-        estimate_robot: Whether the spreads of the robot's errors and of the misfit are found from the data.
+        estimate_robot: Whether the spread of the robot's errors is found from the data.
         estimate_px: Whether that of the marks follows the extras.
+        estimate_misfit: Whether a misfit may be found, where the robot is.
         iterations: At most.
 
     Raises:
         OpenArmError: INTERNAL, when the start is no description of the views (a mark behind the camera).
     """
     state = State.start(problem, X, Z)
+    if zeros is not None and "zeros" in extras:
+        state = replace(state, zeros=zeros)
     linear = linearise(problem, state, extras, priors)
     if not np.isfinite(linear.twist_cost):
         raise OpenArmError(
@@ -379,7 +378,7 @@ def refine(
         damping = damping * 0.1 if damping > 1e-6 else 0.0
         small = float(np.abs(step[: 6 * (problem.cameras + problem.boards)]).max()) < 1e-9
         if (small or cost - reached < 1e-9 * max(reached, 1.0)) and (not estimate_robot or settled >= 1):
-            if tried or not estimate_robot:
+            if tried or not (estimate_robot and estimate_misfit):
                 break
             found, tried = _with_misfit(linear, noise), True
             if found == noise:
@@ -395,28 +394,12 @@ def refine(
 
 def _with_misfit(linear: Linear, noise: Noise) -> Noise:
     """Return the noise with the most likely misfit, where that is far more likely than none."""
+    parts = linear.within, linear.twist, linear.prior, linear.KMK, linear.both
     views = len(linear.within_cost)
-
-    def value(at: Noise) -> float:
-        level = 12.0 * views * math.log(at.view_px)
-        return level + criterion(*linear.weighed(at), max(at.translation, FLOOR), max(at.rotation, FLOOR))
-
-    best, lowest, first = noise, value(noise), value(noise)
-    around, grid = replace(noise), _MISFITS
-    for _ in range(3):
-        for misfit in grid:
-            trial = replace(around, misfit=misfit)
-            for start in ((trial.translation, trial.rotation), (FLOOR, FLOOR)):
-                spreads = search(*linear.weighed(trial), *start, False)
-                at = replace(trial, translation=spreads[0], rotation=spreads[1])
-                reached = value(at)
-                if reached < lowest:
-                    best, lowest = at, reached
-        if best is noise:
-            return noise
-        around = best
-        grid = tuple(best.misfit * f for f in ((0.7, 1.4) if len(grid) > 2 else (0.85, 1.2)))
-    return best if first - lowest > _EVIDENT else noise
+    translation, rotation, misfit, drop = search_misfit(parts, views, noise.px, noise.translation, noise.rotation)
+    if not (np.isfinite(drop) and drop > _EVIDENT):
+        return noise
+    return replace(noise, translation=translation, rotation=rotation, misfit=misfit)
 
 
 def information_at(problem: Problem, X: Array, Z: Array, noise: Noise) -> Array:

@@ -22,7 +22,7 @@ from scipy import stats
 from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.observability import FEWEST, condition_number, require_accuracy, require_motion
 from openarm_calibration.handeye.problem import Extra, Problem, chain, design
-from openarm_calibration.handeye.refine import Estimate, Noise, pixel_noise, refine
+from openarm_calibration.handeye.refine import FREE, Estimate, Noise, Priors, pixel_noise, refine
 from openarm_common import se3
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
@@ -64,6 +64,7 @@ def pose_tests(problem: Problem, used: Mask, estimate: Estimate, limit: float, u
     Returns:
         By number of the pose, as `problem.pose` counts.
     """
+    problem = problem.posed(estimate.zeros)
     T, B = chain(problem, estimate.X, estimate.Z)
     squares, _, _ = problem.equations(problem.free, estimate.optics, estimate.scale)
     M = squares[:, :6, :6] * estimate.noise.view_px**-2.0
@@ -132,7 +133,12 @@ class SolveConfig(Config):
     robot_rotation: float | None = Field(
         default=None, ge=0.0, description="of the robot's rotation, rad; None: estimated"
     )
-    extras: tuple[Extra, ...] = Field(default=(), description="more unknowns: scale, delay, intrinsics")
+    misfit: bool = Field(
+        default=True, description="estimate what the marks of a view have in common; not with a given robot"
+    )
+    extras: tuple[Extra, ...] = Field(
+        default=(), description="more unknowns: scale, delay, intrinsics, distortion, zeros"
+    )
     reject_outliers: bool = Field(default=True, description="leave poses out that the others contradict")
     false_alarm: float = Field(default=1e-3, gt=0.0, lt=0.5, description="chance that a clean set loses a pose")
     most_translation: float = Field(default=0.003, gt=0.0, description="largest predicted error that is an answer, m")
@@ -180,8 +186,16 @@ class Solution:
         return math.sqrt(np.trace(covariance[:3, :3])), math.sqrt(np.trace(covariance[3:, 3:]))
 
 
-def solve(problem: Problem, config: SolveConfig | None = None) -> Solution:
+def solve(
+    problem: Problem, config: SolveConfig | None = None, priors: Priors = FREE, *, start: Solution | None = None
+) -> Solution:
     """Solve for all mounts of a problem.
+
+    Args:
+        problem: At least three robot poses that differ in rotation about two axes.
+        config: How.
+        priors: Of the extras.
+        start: A solution of nearly the same problem, to start from; None: a closed form.
 
     Raises:
         OpenArmError: DEGENERATE, when the views do not determine the mounts to the accuracy asked for, with the cause
@@ -192,7 +206,7 @@ def solve(problem: Problem, config: SolveConfig | None = None) -> Solution:
     px = config.px or pixel_noise(problem)
     usable, blurred = _sharp(problem, px)
     try:
-        used, estimate, tests = _robust(problem, usable, px, config)
+        used, estimate, tests = _robust(problem, usable, px, config, priors, None if start is None else start.estimate)
     except np.linalg.LinAlgError as error:
         raise OpenArmError(Code.DEGENERATE, f"the {len(problem)} views leave an unknown free; add poses") from error
     require_motion(problem.subset(used))
@@ -229,10 +243,10 @@ def _reason(test: PoseTest) -> str:
 
 
 def _robust(
-    problem: Problem, usable: Mask, px: float, config: SolveConfig
+    problem: Problem, usable: Mask, px: float, config: SolveConfig, priors: Priors, start: Estimate | None
 ) -> tuple[Mask, Estimate, tuple[PoseTest, ...]]:
     used = usable.copy()
-    estimate = _refine(problem, used, px, config, None)
+    estimate = _refine(problem, used, px, config, priors, start)
     limit = _limit(problem, used, config)
     tests = pose_tests(problem, used, estimate, limit, usable)
     if not config.reject_outliers or _poses(problem, used) < _FEWEST_TO_REJECT:
@@ -240,11 +254,11 @@ def _robust(
     suspect = any(tests[p].distance > limit for p in problem.pose[usable]) or _spoiled(problem, used, estimate)
     if not suspect:
         return used, estimate, tests
-    used = _consensus(problem, usable, config)
-    start: Estimate | None = None
+    used = _consensus(problem.posed(estimate.zeros), usable, config)
+    start = None
     seen: set[bytes] = set()
     for _ in range(8):
-        estimate = _refine(problem, used, px, config, start)
+        estimate = _refine(problem, used, px, config, priors, start)
         tests = pose_tests(problem, used, estimate, _limit(problem, used, config), usable)
         passing = np.array([tests[p].distance <= tests[p].limit for p in problem.pose])
         wanted = usable & passing
@@ -255,12 +269,19 @@ def _robust(
     return used, estimate, tests
 
 
-def _refine(problem: Problem, used: Mask, px: float, config: SolveConfig, start: Estimate | None) -> Estimate:
+def _refine(
+    problem: Problem, used: Mask, px: float, config: SolveConfig, priors: Priors, start: Estimate | None
+) -> Estimate:
     part = problem.subset(used)
+    zeros = None if start is None else start.zeros
     given = config.robot_translation is not None and config.robot_rotation is not None
     noise = Noise(px, config.robot_translation or 0.0, config.robot_rotation or 0.0) if given else Noise(px, 1e-4, 1e-4)
     X, Z = (start.X, start.Z) if start is not None else starting_mounts(part)
-    return refine(part, X, Z, noise, extras=config.extras, estimate_robot=not given)
+    return refine(
+        part, X, Z, noise, zeros=zeros, extras=config.extras, priors=priors, estimate_robot=not given,
+        estimate_px=config.px is None and bool({"intrinsics", "distortion", "scale"} & set(config.extras)),
+        estimate_misfit=config.misfit,
+    )  # fmt: skip
 
 
 def _limit(problem: Problem, used: Mask, config: SolveConfig) -> float:
@@ -279,7 +300,7 @@ def _poses(problem: Problem, used: Mask) -> int:
 
 def _spoiled(problem: Problem, used: Mask, estimate: Estimate) -> bool:
     """Return whether a few views carry most of the residual that the robot's estimated spread explains away."""
-    rms = _reprojection(problem, estimate.X, estimate.Z)[used]
+    rms = _reprojection(problem.posed(estimate.zeros), estimate.X, estimate.Z)[used]
     return bool(rms.max() > 4.0 * np.median(rms) and rms.max() > 3.0 * estimate.noise.px)
 
 

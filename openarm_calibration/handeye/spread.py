@@ -138,6 +138,61 @@ def search(
 
 
 @njit(cache=True, nogil=True)
+def _with_misfit(
+    parts: tuple[Array, Array, Array, Array, Array], views: int, px: float, t: float, r: float, misfit: float
+) -> float:  # pragma: no cover - compiled
+    within, twist, prior, KMK, both = parts
+    level = 1.0 + misfit * misfit
+    weight = 1.0 / (px * px * level)
+    full = within / (px * px) + twist * weight + prior
+    return 6.0 * views * np.log(level) + criterion(full, KMK * weight, both * weight, max(t, 1e-7), max(r, 1e-7))
+
+
+@njit(cache=True, nogil=True)
+def search_misfit(
+    parts: tuple[Array, Array, Array, Array, Array], views: int, px: float, start_t: float, start_r: float
+) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
+    """Search for the most likely spreads of the robot, m and rad, and misfit.
+
+    Args:
+        parts: within, twist and prior (p + 1, p + 1), KMK (poses, 6, 6) and both (poses, 6, p + 1), see `Linear`.
+        views: Number.
+        px: Spread of a mark, px.
+        start_t: Spread of the robot without misfit, m.
+        start_r: The same, rad.
+
+    Returns:
+        Translation, rotation, misfit, and by how much the criterion is lower than without misfit.
+    """
+    first = _with_misfit(parts, views, px, start_t, start_r, 0.0)
+    best, at_t, at_r, at_m = first, start_t, start_r, 0.0
+    for k in range(5):
+        for i in range(4):
+            for j in range(4):
+                t = start_t * 0.25**i if i < 3 else 1e-7
+                r = start_r * 0.25**j if j < 3 else 1e-7
+                value = _with_misfit(parts, views, px, t, r, 4.0**k)
+                if value < best:
+                    best, at_t, at_r, at_m = value, t, r, 4.0**k
+    span = 2.0
+    for _ in range(60):
+        if at_m == 0.0 or span < 1.03:
+            break
+        better = False
+        for axis in range(3):
+            for factor in (span, 1.0 / span):
+                t = max(at_t * (factor if axis == 0 else 1.0), 1e-7)
+                r = max(at_r * (factor if axis == 1 else 1.0), 1e-7)
+                m = at_m * (factor if axis == 2 else 1.0)
+                value = _with_misfit(parts, views, px, t, r, m)
+                if value < best - 1e-6:
+                    best, at_t, at_r, at_m, better = value, t, r, m, True
+        if not better:
+            span = span**0.5
+    return at_t, at_r, at_m, first - best
+
+
+@njit(cache=True, nogil=True)
 def _answers(
     full: Array, KMK: Array, both: Array, spreads: Array, values: Array, answers: Array, covariances: Array
 ) -> None:  # pragma: no cover - compiled

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Leave-one-out on sets of real robots: closed forms, the refinement without and with misfit, joint zeros.
+
+    python -m benchmarks.real_handeye FOLDER [--robot openarm_v1]
+
+FOLDER holds a JSON file for each set, in SI units: `camera` (width, height, K), `setup` (eye_in_hand or eye_to_hand),
+`chain` (base and tip link), and `samples`, each with `T_base_tip`, `corners_px`, `corners_board_m`, and, where joint
+zeros can be estimated, `joint_positions`. Nobody knows the true mounts: each view is left out in turn and predicted
+by the answer of the others, in px, and in mm and degrees against the pose of its own corners at the answer's intrinsics.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.report import Row, write_report
+from openarm_calibration.board.detect import guess_pose
+from openarm_calibration.handeye.closed_form import METHODS, closed_form
+from openarm_calibration.handeye.marks import fit_poses, project
+from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, chain
+from openarm_calibration.handeye.solve import SolveConfig, solve
+from openarm_calibration.handeye.zeros import ArmView, Kinematics, ZerosConfig, ZerosResult, solve_zeros
+from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.errors import OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.types import Array
+
+_SETUPS: dict[str, Setup] = {"eye_in_hand": "in_hand", "eye_to_hand": "to_hand"}
+_LAX = SolveConfig(most_translation=10.0, most_rotation=10.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RealSet:
+    """A set, and the joints behind its poses; `arm` is empty where they are not known."""
+
+    name: str
+    problem: Problem
+    arm: tuple[ArmView, ...]
+
+    @property
+    def setup(self) -> Setup:
+        """Of its views."""
+        return self.problem.views[0].setup
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What one answer predicts: T_camera_board (n, 4, 4) of all views of the set, and its change of the intrinsics."""
+
+    T: Array
+    optics: Array
+
+
+def read_set(path: Path) -> RealSet:
+    """Read a JSON file of a set."""
+    data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    camera = data["camera"]
+    K = np.array(camera["K"], dtype=np.float64).reshape(3, 3)
+    optics = Intrinsics(camera["width"], camera["height"], K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    distortion = np.array(camera.get("D", ()), dtype=np.float64)
+    views: list[View] = []
+    guesses: list[Array] = []
+    for number, sample in enumerate(data["samples"]):
+        points = np.array(sample["corners_board_m"], dtype=np.float64)
+        pixels = np.array(sample["corners_px"], dtype=np.float64)
+        if distortion.any():
+            pixels = cv2.undistortPoints(pixels[:, None], K, distortion, P=K)[:, 0].astype(np.float64)
+        views.append(
+            View(points, pixels, np.array(sample["T_base_tip"]), _SETUPS[data["setup"]], pose=number, name=sample["id"])
+        )
+        guesses.append(guess_pose(points, pixels, 0.0, optics)[0])
+    arm = tuple(
+        ArmView(view, *data["chain"], sample["joint_positions"], guess)
+        for view, sample, guess in zip(views, data["samples"], guesses, strict=True)
+        if sample.get("joint_positions")
+    )
+    return RealSet(path.stem, assemble(views, [optics], guesses), arm)
+
+
+def _poses(problem: Problem, X: Array, Z: Array) -> Array:
+    return chain(problem, X[None] if X.ndim == 2 else X, Z[None] if Z.ndim == 2 else Z)[0]
+
+
+def fit_closed(real: RealSet, keep: Array, method: str) -> Fit:
+    """Answer with a closed form of the views `keep`."""
+    part = real.problem.subset(keep)
+    mounts = closed_form(method, real.setup, part.A, part.free)
+    return Fit(_poses(real.problem, mounts.X, mounts.Z), np.zeros((1, 6)))
+
+
+def fit_solver(real: RealSet, keep: Array, config: SolveConfig) -> Fit:
+    """Answer with the solver."""
+    estimate = solve(real.problem.subset(keep), config).estimate
+    return Fit(_poses(real.problem, estimate.X, estimate.Z), estimate.optics)
+
+
+def zeros_of(real: RealSet, keep: Array, description: RobotDescription) -> ZerosResult:
+    """Return the zeros by the views `keep`."""
+    return solve_zeros(description, [real.arm[i] for i in keep], real.problem.intrinsics, ZerosConfig(solver=_LAX))
+
+
+def fit_zeros(real: RealSet, keep: Array, description: RobotDescription) -> Fit:
+    """Answer with zeros."""
+    found = zeros_of(real, keep, description)
+    first = real.arm[0]
+    kinematics = Kinematics(description, first.base, first.tip, found.names)
+    A = np.array([kinematics.evaluate(view.q, found.values)[0] for view in real.arm])
+    estimate = found.solution.estimate
+    return Fit(_poses(replace(real.problem, A=A), estimate.X, estimate.Z), estimate.optics)
+
+
+def left_out(real: RealSet, fit: Callable[[Array], Fit]) -> Array:
+    """Return (n, 3) errors of each view, predicted by the others: px rms, m at the board's centre, rad."""
+    problem = real.problem
+    out: list[tuple[float, float, float]] = []
+    for i, view in enumerate(problem.views):
+        try:
+            found = fit(np.array([k for k in range(len(problem)) if k != i]))
+        except OpenArmError:
+            out.append((math.nan,) * 3)
+            continue
+        row = problem.camera_rows(found.optics)[i]
+        T = found.T[i]
+        px = float(np.sqrt(np.mean(np.sum((project(view.points, view.radius, T, row) - view.pixels) ** 2, axis=1))))
+        own = fit_poses(
+            view.points, view.pixels, np.array([0, len(view.points)]), np.array([view.radius]),
+            problem.free[i : i + 1], row[None],
+        )[0][0]  # fmt: skip
+        centre = np.append(view.points.mean(axis=0), 1.0)
+        out.append(
+            (px, float(np.linalg.norm((T @ centre - own @ centre)[:3])), se3.angle_between(T[:3, :3], own[:3, :3]))
+        )
+    return np.array(out)
+
+
+def show(name: str, errors: Array, seconds: float) -> None:
+    """Print a row."""
+    px = errors[:, 0]
+    mm, degrees = errors[:, 1] * 1e3, np.degrees(errors[:, 2])
+    print(
+        f"  {name:16s} px median {np.median(px):6.2f} rms {np.sqrt(np.mean(px**2)):6.2f}"
+        f"   mm median {np.median(mm):6.2f} p95 {np.percentile(mm, 95):6.2f} rms {np.sqrt(np.mean(mm**2)):6.2f}"
+        f"   deg median {np.median(degrees):5.2f} p95 {np.percentile(degrees, 95):5.2f}"
+        f" rms {np.sqrt(np.mean(degrees**2)):5.2f}   {seconds:5.2f} s",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--robot", default="openarm_v1", help="whose joints are in the sets")
+    parser.add_argument("--json", type=Path, help="where to write the metrics")
+    arguments = parser.parse_args()
+    description = RobotDescription.from_folder(arguments.robot)
+    rows: list[Row] = []
+    for path in sorted(arguments.folder.glob("*.json")):
+        real = read_set(path)
+        print(f"{real.name}: {len(real.problem)} views, {real.setup}")
+        answers: dict[str, Callable[[Array], Fit]] = {
+            method: lambda keep, method=method, real=real: fit_closed(real, keep, method) for method in METHODS
+        }
+        before = _LAX.model_copy(update={"misfit": False})
+        answers["without misfit"] = lambda keep, real=real: fit_solver(real, keep, before)
+        answers["refined"] = lambda keep, real=real: fit_solver(real, keep, _LAX)
+        if real.arm:
+            answers["refined, zeros"] = lambda keep, real=real: fit_zeros(real, keep, description)
+        rms: dict[str, Array] = {}
+        for name, fit in answers.items():
+            begin = time.thread_time()
+            errors = left_out(real, fit)
+            show(name, errors, time.thread_time() - begin)
+            rms[name] = np.sqrt(np.mean(errors**2, axis=0))
+        for column, (unit, factor) in enumerate((("px", 1.0), ("mm", 1e3), ("deg", math.degrees(1.0)))):
+            peer = min(METHODS, key=lambda m: float(np.nan_to_num(rms[m][column], nan=math.inf)))
+            for name in list(answers)[len(METHODS) :]:
+                metric = f"{real.name}_{name.replace(', ', '_').replace(' ', '_')}_loo_{unit}"
+                rows.append(
+                    Row(
+                        metric, float(rms[name][column] * factor), unit, "lower", None, peer,
+                        float(rms[peer][column] * factor), len(real.problem),
+                    )
+                )  # fmt: skip
+        whole = solve(real.problem, _LAX).estimate.noise
+        print(f"  noise: {whole}")
+        if real.arm:
+            found = zeros_of(real, np.arange(len(real.problem)), description)
+            print("  " + "\n  ".join(found.sentences()))
+            print(f"  noise: {found.solution.estimate.noise}")
+    write_report(rows, arguments.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,294 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Zeros of the joints, estimated with the mounts of cameras and boards in one problem.
+
+An encoder whose zero is off reports `q`, where the joint is at `q + offset`. Views of any number of sets, cameras and
+arms share the offsets of the joints that they have in common; each set has the mounts that it has. Lengths of links and
+flexure, `compliance × torque` of a joint that gives way under load, may be unknowns too.
+
+A mount takes up the offset of the joint next to it: a camera or board that stands still on the base that of the first
+joint, one in the hand that of the last. There the prior decides, and `ZerosResult` says so joint by joint. The forward
+kinematics is exact, and linearised again at each step (iterated least squares, as in Hollerbach and Wampler 1996, "The
+calibration index and taxonomy for robot kinematic calibration methods"). m, rad, N m.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from pydantic import Field
+
+from openarm_calibration.handeye.problem import View, assemble, layout
+from openarm_calibration.handeye.refine import Priors
+from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
+from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.urdf import Joint
+from openarm_common.types import Array
+
+#: Posterior over prior deviation above which the data say next to nothing of a joint.
+_UNTOLD = 0.9
+
+
+class ZerosConfig(Config):
+    """What is known of the zeros beforehand, and what else is estimated."""
+
+    sigma: float = Field(default=math.radians(3.0), gt=0.0, description="of a joint's offset, rad")
+    by_joint: dict[str, float] = Field(
+        default_factory=dict, description="the same of single joints, rad; 0 takes the reported zero for true"
+    )
+    lengths: float | None = Field(default=None, gt=0.0, description="of links' lengths, m; None: as described")
+    flexure: float | None = Field(default=None, gt=0.0, description="of joints' compliance, rad/(N m); None: stiff")
+    solver: SolveConfig = Field(
+        default=SolveConfig(most_translation=10.0, most_rotation=10.0), description="of mounts and noise"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematics:
+    """Pose of a tip in a base frame, and how it changes with the parameters of the joints.
+
+    Args:
+        description: The robot.
+        base: Link in whose frame the pose is.
+        tip: Link.
+        parameters: Names: a joint for its offset, `joint length`, `joint flexure`; those of other chains are allowed.
+    """
+
+    description: RobotDescription
+    base: str
+    tip: str
+    parameters: tuple[str, ...]
+
+    def evaluate(
+        self, q: Mapping[str, float], change: Array, torque: Mapping[str, float] | None = None
+    ) -> tuple[Array, Array]:
+        """Return A (4, 4) and its change by each parameter (6, parameters): position in base axes, rotation in tip's.
+
+        Args:
+            q: Positions that the encoders report, rad.
+            change: (parameters,) rad, m, rad/(N m).
+            torque: Of the joints, N m; none for stiff ones.
+        """
+        at = dict(zip(self.parameters, np.asarray(change).tolist(), strict=True))
+        index = {name: k for k, name in enumerate(self.parameters)}
+        (T_tip, moves_tip), (T_base, moves_base) = (
+            self._walk(link, q, at, torque or {}) for link in (self.tip, self.base)
+        )
+        by = np.zeros((6, len(self.parameters)))
+        p = T_tip[:3, 3]
+        for moves, sign in ((moves_tip, 1.0), (moves_base, -1.0)):
+            for name, factor, axis, point, turns in moves:
+                if name not in index:
+                    continue
+                by[:3, index[name]] += sign * factor * (np.cross(axis, p - point) if turns else axis)
+                by[3:, index[name]] += sign * factor * axis * turns
+        by[:3] = T_base[:3, :3].T @ by[:3]
+        by[3:] = T_tip[:3, :3].T @ by[3:]
+        return se3.inverse(T_base) @ T_tip, by
+
+    def _walk(
+        self, link: str, q: Mapping[str, float], at: Mapping[str, float], torque: Mapping[str, float]
+    ) -> tuple[Array, list[tuple[str, float, Array, Array, bool]]]:
+        T = np.eye(4)
+        moves: list[tuple[str, float, Array, Array, bool]] = []
+        for joint in self.description.chain(link):
+            origin = joint.T_parent_joint
+            length = f"{joint.name} length"
+            if length in at:
+                along = origin[:3, 3] / np.linalg.norm(origin[:3, 3])
+                moves.append((length, 1.0, T[:3, :3] @ along, T[:3, 3], False))
+                origin = origin.copy()
+                origin[:3, 3] += along * at[length]
+            T = T @ origin
+            if joint.type == "fixed":
+                continue
+            leader = joint.mimic or joint.name
+            if leader not in q:
+                there = ", ".join(q) or "no joints"
+                raise OpenArmError(Code.INVALID_ARGUMENT, f"no position of joint {leader!r}; got {there}")
+            flexure, load = f"{leader} flexure", torque.get(leader, 0.0)
+            own = q[leader] + at.get(leader, 0.0) + at.get(flexure, 0.0) * load
+            ratio = joint.multiplier if joint.mimic is not None else 1.0
+            axis = T[:3, :3] @ joint.axis
+            for name, factor in ((leader, ratio), (flexure, ratio * load)):
+                moves.append((name, factor, axis, T[:3, 3].copy(), joint.type != "prismatic"))
+            T = T @ joint.motion(ratio * own + (joint.offset if joint.mimic is not None else 0.0))
+        return T, moves
+
+
+@dataclass(frozen=True, eq=False)
+class _Posture:
+    """Joint positions of a view, as `problem.Arm`."""
+
+    kinematics: Kinematics
+    q: Mapping[str, float]
+    torque: Mapping[str, float]
+
+    @property
+    def count(self) -> int:
+        return len(self.kinematics.parameters)
+
+    def at(self, zeros: Array) -> tuple[Array, Array]:
+        return self.kinematics.evaluate(self.q, zeros, self.torque)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmView:
+    """A view with the joint positions that its robot pose comes from.
+
+    Args:
+        view: Its A is not read.
+        base: Link in whose frame A is.
+        tip: Link whose pose A is.
+        q: Positions that the encoders report, rad.
+        guess: (4, 4) T_camera_board.
+        torque: Of the joints, N m; for flexure.
+    """
+
+    view: View
+    base: str
+    tip: str
+    q: Mapping[str, float]
+    guess: Array
+    torque: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ZerosResult:
+    """Offsets of the joints: where a joint is, minus what its encoder reports; and the rest of the parameters.
+
+    Args:
+        names: Of the parameters: a joint for its offset, `joint length`, `joint flexure`.
+        values: (parameters,) rad, m, rad/(N m).
+        covariance: (parameters, parameters), the prior included.
+        prior: (parameters,) standard deviations before anything was seen.
+        solution: Mounts and noise, at these values.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    prior: Array
+    solution: Solution
+
+    @property
+    def sigma(self) -> Array:
+        """(parameters,) standard deviations."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @property
+    def told(self) -> tuple[bool, ...]:
+        """Whether the data tell each parameter; where not, the prior decides."""
+        return tuple(bool(s < _UNTOLD * p) for s, p in zip(self.sigma, self.prior, strict=True))
+
+    def mounts_covariance(self) -> Array:
+        """(parameters, parameters) of everything: mounts of cameras, then of boards, then these parameters."""
+        return self.solution.estimate.covariance()
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return a line for each parameter, with whether the data tell it."""
+        out: list[str] = []
+        for name, value, sigma, prior, told in zip(
+            self.names, self.values, self.sigma, self.prior, self.told, strict=True
+        ):
+            if name.endswith(" length"):
+                figure = f"{value * 1e3:+.2f} ± {sigma * 1e3:.2f} mm"
+            elif name.endswith(" flexure"):
+                figure = f"{math.degrees(value):+.3f} ± {math.degrees(sigma):.3f}° per N m"
+            else:
+                figure = f"{math.degrees(value):+.2f} ± {math.degrees(sigma):.2f}°"
+            if prior == 0.0:
+                out.append(f"{name}: taken for true")
+            elif told:
+                out.append(f"{name}: {figure}")
+            else:
+                out.append(f"{name}: {figure}; these views can't tell it from a mount: the prior decides")
+        return tuple(out)
+
+
+def joints_of(description: RobotDescription, views: Sequence[ArmView]) -> tuple[str, ...]:
+    """Return the joints that move a tip against its base in any of the views, in the order of the chains.
+
+    Args:
+        description: The robot.
+        views: At least one.
+    """
+    out: list[str] = []
+    for base, tip in dict.fromkeys((view.base, view.tip) for view in views):
+        ahead, behind = description.chain(tip), description.chain(base)
+        for joint in (*ahead, *behind):
+            own = joint.mimic or joint.name
+            if joint.type != "fixed" and (joint in ahead) != (joint in behind) and own not in out:
+                out.append(own)
+    return tuple(out)
+
+
+def _parameters(
+    description: RobotDescription, views: Sequence[ArmView], config: ZerosConfig
+) -> tuple[tuple[str, ...], Array]:
+    joints = joints_of(description, views)
+    for name in config.by_joint:
+        if name not in joints:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"a prior for {name!r}, which moves nothing here; joints: {', '.join(joints)}"
+            )
+    names, sigma = list(joints), [config.by_joint.get(name, config.sigma) for name in joints]
+    if config.lengths is not None:
+        long = [name for name in joints if _has_length(description.joint(name))]
+        names += [f"{name} length" for name in long]
+        sigma += [config.lengths] * len(long)
+    if config.flexure is not None:
+        names += [f"{name} flexure" for name in joints]
+        sigma += [config.flexure] * len(joints)
+    return tuple(names), np.array(sigma)
+
+
+def _has_length(joint: Joint) -> bool:
+    return bool(np.linalg.norm(joint.T_parent_joint[:3, 3]) > 1e-6)
+
+
+def solve_zeros(
+    description: RobotDescription,
+    views: Sequence[ArmView],
+    intrinsics: Sequence[Intrinsics],
+    config: ZerosConfig | None = None,
+) -> ZerosResult:
+    """Estimate the zeros of the joints with all mounts.
+
+    Args:
+        description: The robot, whose forward kinematics the reported positions are put through.
+        views: Of any number of sets: `View.camera` and `View.board` number the mounts, `View.pose` the robot poses.
+        intrinsics: Of each camera.
+        config: Priors.
+
+    Raises:
+        OpenArmError: DEGENERATE, when the views determine no mount; INVALID_ARGUMENT, for no view, or a prior of a joint
+            that moves nothing.
+    """
+    config = config or ZerosConfig()
+    if not views:
+        raise OpenArmError(Code.INVALID_ARGUMENT, "no views; take samples of at least one camera and board")
+    names, prior = _parameters(description, views, config)
+    chains = {ends: Kinematics(description, *ends, names) for ends in {(view.base, view.tip) for view in views}}
+    values = np.zeros(len(names))
+    armed = [
+        replace(view.view, arm=_Posture(chains[view.base, view.tip], view.q, view.torque)) for view in views
+    ]
+    problem = assemble(armed, intrinsics, [view.guess for view in views]).posed(np.zeros(len(names)))
+    solver = config.solver.model_copy(update={"extras": (*config.solver.extras, "zeros")})
+    priors = Priors(zeros=prior)
+    # views that contradict the others may do so by the zeros alone, as long as these are not known
+    solution = solve(problem, solver.model_copy(update={"reject_outliers": False}), priors)
+    if solver.reject_outliers:
+        solution = solve(problem, solver, priors, start=solution)
+    estimate = solution.estimate
+    values, covariance = estimate.zeros, estimate.covariance()
+    columns = layout(solution.problem, estimate.extras)["zeros"]
+    covariance = covariance[columns, columns]
+    return ZerosResult(names, values, covariance, prior, solution)
