@@ -26,10 +26,11 @@ import numpy as np
 from benchmarks.report import Row, write_report
 from openarm_calibration.board.detect import guess_pose
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
+from openarm_calibration.handeye.kinematics import Kinematics
 from openarm_calibration.handeye.marks import fit_poses, project
 from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, chain
 from openarm_calibration.handeye.solve import SolveConfig, solve
-from openarm_calibration.handeye.zeros import ArmView, Kinematics, ZerosConfig, ZerosResult, solve_zeros
+from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, solve_zeros
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import OpenArmError

@@ -73,7 +73,7 @@ def closed_form(method: str, setup: Setup, A: Array, C: Array) -> Mounts:
     solve: Callable[[str, Array, Array], Mounts] = _hand_eye if name in HAND_EYE else _robot_world
     try:
         mounts = solve(name, B, C)
-    except cv2.error as error:
+    except (cv2.error, np.linalg.LinAlgError) as error:
         text = str(error).strip().splitlines()[-1]
         raise OpenArmError(Code.DEGENERATE, f"{name} has no answer for these {len(A)} poses: {text}") from error
     if not (_is_rigid(mounts.X) and _is_rigid(mounts.Z)):

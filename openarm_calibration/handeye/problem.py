@@ -46,6 +46,10 @@ class Arm(Protocol):
         """Number of offsets."""
         ...
 
+    def scaled(self, factor: float) -> Arm:
+        """Return the same with positions in another unit."""
+        ...
+
     def at(self, zeros: Array) -> tuple[Array, Array]:
         """Return A (4, 4) at offsets (count,) of the zeros, and how it changes with each (6, count)."""
         ...

@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import Field
 from scipy import stats
 
+from openarm_calibration.handeye.causes import diagnose, freed
 from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.observability import FEWEST, condition_number, require_accuracy, require_motion
 from openarm_calibration.handeye.problem import Extra, Problem, chain, design
@@ -119,6 +120,9 @@ def _twist(T_from: Array, T_to: Array) -> Array:
     return np.concatenate([T_to[:3, 3] - T_from[:3, 3] - np.cross(w, half), w])
 
 
+#: An answer with a smaller spread of the robot's pose and of the marks is not one of wrong input, m, rad and px.
+_GOOD_ARM = (1e-3, math.radians(0.1))
+_GOOD_PX = 1.0
 #: With fewer poses it can't be determined which one is wrong; a clean set would lose poses by chance.
 _FEWEST_TO_REJECT = 7
 
@@ -202,6 +206,16 @@ def solve(
             and what to add; INVALID_ARGUMENT, for numbers that are not finite.
     """
     config = config or SolveConfig()
+    try:
+        return _solve(problem, config, priors, start)
+    except OpenArmError as error:
+        named = _explained(problem, error)
+        if not named:
+            raise
+        raise OpenArmError(Code.DEGENERATE, f"{named}; so there is no answer: {error.message}") from error
+
+
+def _solve(problem: Problem, config: SolveConfig, priors: Priors, start: Solution | None) -> Solution:
     require_motion(problem)
     px = config.px or pixel_noise(problem)
     usable, blurred = _sharp(problem, px)
@@ -217,6 +231,25 @@ def solve(
     ]
     outliers = tuple(sorted((*blurred, *contradicted), key=lambda outlier: outlier.index))
     return Solution(problem, used, estimate, outliers, tests, condition_number(problem, estimate.information))
+
+
+def _explained(problem: Problem, error: OpenArmError) -> str:
+    """Return the sentence of what is wrong with the input, when that is why there is no answer; empty otherwise."""
+    if error.code not in (Code.DEGENERATE, Code.INTERNAL) or len(problem) < FEWEST:
+        return ""
+    noise = Noise(pixel_noise(problem), 1e-4, 1e-4)
+    base, alternatives = None, {}
+    try:
+        require_motion(problem)
+        X, Z = starting_mounts(problem)
+        base = refine(problem, X, Z, noise, estimate_robot=True)
+        if base.noise.translation < _GOOD_ARM[0] and base.noise.rotation < _GOOD_ARM[1] and base.noise.px < _GOOD_PX:
+            return ""  # the views agree with each other: what lacks is more of them
+        base, alternatives = freed(problem, base.X, base.Z, base.noise)
+    except (OpenArmError, np.linalg.LinAlgError):
+        pass
+    causes = diagnose(problem, base, alternatives)
+    return causes[0].sentence if causes else ""
 
 
 def _sharp(problem: Problem, px: float) -> tuple[Mask, list[Outlier]]:
