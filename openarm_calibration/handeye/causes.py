@@ -160,7 +160,9 @@ def _described(problem: Problem, base: Estimate, found: Freed) -> Cause:
         text += f" ({value:.4f} ± {sigma:.4f} of it)"
     elif found.name == "focal length":
         f = stated.fx if abs(value - estimate.intrinsics[0, 0]) < 1e-12 else stated.fy
-        text = f"the focal length seems {value / f * 100:+.2f} % off its value in camera_info; are these its intrinsics?"
+        text = (
+            f"the focal length seems {value / f * 100:+.2f} % off its value in camera_info; are these its intrinsics?"
+        )
     elif found.name == "principal point":
         cx, cy = estimate.intrinsics[0, 2:]
         text = f"the principal point seems ({cx:+.1f}, {cy:+.1f}) px off its value in camera_info"

@@ -31,6 +31,8 @@ _SMALL_SECOND_AXIS = math.radians(10.0)
 _WORST_CONDITION = 1e12
 #: No arm in order is off by so much from pose to pose, m and rad.
 _BAD_ARM = (1.5e-3, math.radians(0.15))
+#: Nor do the marks of a view share so many times their own spread.
+_BAD_MISFIT = 3.0
 #: Six columns of a mount in units of 1 mm and 0.1°.
 UNITS = np.array([1e-3] * 3 + [math.radians(0.1)] * 3)
 
@@ -173,10 +175,11 @@ def _degenerate(seen: Motion, noise: Noise, what: str) -> OpenArmError:
         advice = f"rotate by 15° or more about {_other(seen.axis)} too"
     elif seen.poses < 6:
         cause = f"too few poses ({seen.poses})"
-    elif noise.translation > _BAD_ARM[0] or noise.rotation > _BAD_ARM[1]:
+    elif noise.translation > _BAD_ARM[0] or noise.rotation > _BAD_ARM[1] or noise.misfit > _BAD_MISFIT:
         cause = (
             f"{seen.poses} poses that contradict each other, as if the robot were off by"
             f" {noise.translation * 1e3:.1f} mm and {math.degrees(noise.rotation):.2f}°"
+            + (f", and their marks by {noise.view_px:.1f} px" if noise.misfit > _BAD_MISFIT else "")
         )
         advice = "check the joint zeros, the intrinsics in camera_info, the size of the board, and that it did not move"
     else:

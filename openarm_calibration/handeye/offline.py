@@ -15,12 +15,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from openarm_calibration.handeye.closed_form import ALGORITHMS, REFINED, closed_form
+from openarm_calibration.handeye.closed_form import ALGORITHMS, METHODS, REFINED, closed_form
+from openarm_calibration.handeye.left_out import side_by_side
 from openarm_calibration.handeye.observability import condition_number, require_motion
 from openarm_calibration.handeye.problem import Problem, View, assemble
 from openarm_calibration.handeye.refine import Estimate, invert_scaled, mount_error
 from openarm_calibration.handeye.solve import Outlier, Solution, SolveConfig, solve
-from openarm_calibration.handeye.verdict import Limits, Verdict, assess, side_by_side
+from openarm_calibration.handeye.verdict import Limits, Verdict, assess
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_calibration.store.store import StoredCalibration
 from openarm_common import se3
@@ -128,7 +129,9 @@ def judged(
     before = None if stored is None else stored.T_parent_link @ T_LINK_OPTICAL
     verdict = assess(problem, solution, limits, before)
     X = solution.estimate.X[0]
-    sigma_t, sigma_r = solution.sigma()
+    sigma_t, sigma_r = verdict.figures["accuracy_translation"], verdict.figures["accuracy_rotation"]
+    if algorithm == REFINED and verdict.closed_form:
+        algorithm = verdict.closed_form
     if algorithm != REFINED:
         part = problem.subset(solution.used)
         require_motion(part)

@@ -212,6 +212,11 @@ class Linear:
         )
 
 
+def at_zeros(problem: Problem, estimate: Estimate) -> Problem:
+    """Return views with the robot poses that an estimate has, where the joints' zeros were free."""
+    return problem.posed(estimate.zeros) if "zeros" in estimate.extras else problem
+
+
 def linearise(problem: Problem, state: State, extras: Sequence[Extra], priors: Priors = FREE) -> Linear:
     """Return the normal equations at a state.
 
@@ -305,8 +310,11 @@ def evidence(problem: Problem, linear: Linear, noise: Noise, extras: Sequence[Ex
     value = criterion(*linear.weighed(noise), max(noise.translation, FLOOR), max(noise.rotation, FLOOR))
     own = 2.0 * math.log(noise.px) * float(np.sum(2 * problem.marks - 6))
     sigma, _ = priors.of(problem, extras)
-    return value + own + 12.0 * len(problem) * math.log(noise.view_px) + 2.0 * float(
-        np.log(sigma[np.isfinite(sigma)]).sum()
+    return (
+        value
+        + own
+        + 12.0 * len(problem) * math.log(noise.view_px)
+        + 2.0 * float(np.log(sigma[np.isfinite(sigma)]).sum())
     )
 
 

@@ -23,7 +23,7 @@ from openarm_calibration.handeye.causes import diagnose, freed
 from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.observability import FEWEST, condition_number, require_accuracy, require_motion
 from openarm_calibration.handeye.problem import Extra, Problem, chain, design
-from openarm_calibration.handeye.refine import FREE, Estimate, Noise, Priors, pixel_noise, refine
+from openarm_calibration.handeye.refine import FREE, Estimate, Noise, Priors, at_zeros, pixel_noise, refine
 from openarm_common import se3
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
@@ -65,7 +65,7 @@ def pose_tests(problem: Problem, used: Mask, estimate: Estimate, limit: float, u
     Returns:
         By number of the pose, as `problem.pose` counts.
     """
-    problem = problem.posed(estimate.zeros)
+    problem = at_zeros(problem, estimate)
     T, B = chain(problem, estimate.X, estimate.Z)
     squares, _, _ = problem.equations(problem.free, estimate.optics, estimate.scale)
     M = squares[:, :6, :6] * estimate.noise.view_px**-2.0
@@ -243,7 +243,8 @@ def _explained(problem: Problem, error: OpenArmError) -> str:
         require_motion(problem)
         X, Z = starting_mounts(problem)
         base = refine(problem, X, Z, noise, estimate_robot=True)
-        if base.noise.translation < _GOOD_ARM[0] and base.noise.rotation < _GOOD_ARM[1] and base.noise.px < _GOOD_PX:
+        found = base.noise
+        if found.translation < _GOOD_ARM[0] and found.rotation < _GOOD_ARM[1] and found.view_px < _GOOD_PX:
             return ""  # the views agree with each other: what lacks is more of them
         base, alternatives = freed(problem, base.X, base.Z, base.noise)
     except (OpenArmError, np.linalg.LinAlgError):
@@ -287,7 +288,7 @@ def _robust(
     suspect = any(tests[p].distance > limit for p in problem.pose[usable]) or _spoiled(problem, used, estimate)
     if not suspect:
         return used, estimate, tests
-    used = _consensus(problem.posed(estimate.zeros), usable, config)
+    used = _consensus(at_zeros(problem, estimate), usable, config)
     start = None
     seen: set[bytes] = set()
     for _ in range(8):
@@ -333,7 +334,7 @@ def _poses(problem: Problem, used: Mask) -> int:
 
 def _spoiled(problem: Problem, used: Mask, estimate: Estimate) -> bool:
     """Return whether a few views carry most of the residual that the robot's estimated spread explains away."""
-    rms = _reprojection(problem.posed(estimate.zeros), estimate.X, estimate.Z)[used]
+    rms = _reprojection(at_zeros(problem, estimate), estimate.X, estimate.Z)[used]
     return bool(rms.max() > 4.0 * np.median(rms) and rms.max() > 3.0 * estimate.noise.px)
 
 

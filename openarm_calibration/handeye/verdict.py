@@ -14,15 +14,14 @@ import numpy as np
 from pydantic import Field
 
 from openarm_calibration.handeye.causes import diagnose, freed
-from openarm_calibration.handeye.closed_form import METHODS, closed_form
-from openarm_calibration.handeye.problem import Problem, chain, project, residuals
+from openarm_calibration.handeye.left_out import held_out, reprojection_rms, rival
+from openarm_calibration.handeye.problem import Problem
 from openarm_calibration.handeye.refine import Estimate, Priors, mount_error, refine
 from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
 from openarm_calibration.handeye.transforms import difference
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config
-from openarm_common.errors import OpenArmError
 from openarm_common.types import Array
 
 Grade = Literal["pass", "warn", "fail"]
@@ -45,15 +44,6 @@ class Limits(Config):
 
 
 @dataclass(frozen=True)
-class Held:
-    """Error of poses that the answer did not see."""
-
-    px: float
-    metres: float
-    by_name: dict[str, tuple[float, float]]
-
-
-@dataclass(frozen=True)
 class Check:
     """One criterion.
 
@@ -70,69 +60,21 @@ class Check:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Grade, why, the figures (SI units, px), and all checks."""
+    """Grade, why, the figures (SI units, px), and all checks.
+
+    Args:
+        grade: Pass, warn or fail.
+        reasons: Texts of the checks beyond their limits.
+        figures: SI units and px.
+        checks: All of them.
+        closed_form: The method whose answer is to be used instead, as it predicts left-out views better; usually none.
+    """
 
     grade: Grade
     reasons: tuple[str, ...]
     figures: dict[str, Any]
     checks: tuple[Check, ...] = ()
-
-
-def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
-    """Leave poses out in turn (`folds` groups; as many as poses is leave-one-out) and predict them.
-
-    Poses whose absence leaves too few to solve are not counted.
-
-    Args:
-        problem: All views.
-        solution: Of them.
-        folds: Number of groups.
-    """
-    used = np.flatnonzero(solution.used)
-    poses = np.unique(problem.pose[used])
-    folds = max(2, min(folds, len(poses)))
-    squares: dict[str, tuple[float, float]] = {}
-    for fold in range(folds):
-        out = np.isin(problem.pose[used], poses[fold::folds])
-        if len(np.unique(problem.pose[used[~out]])) < 3:
-            continue
-        estimate = refine(
-            problem.subset(used[~out]), solution.estimate.X, solution.estimate.Z, solution.estimate.noise,
-            extras=solution.estimate.extras,
-        )  # fmt: skip
-        left = problem.subset(used[out])
-        T, _ = chain(left, estimate.X, estimate.Z)
-        rows = left.camera_rows(estimate.optics)
-        for k, view in enumerate(left.views):
-            away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
-            px = float(np.mean(np.sum(away**2, axis=1)))
-            squares[view.name or str(k)] = px, px * float(T[k, 2, 3] / rows[k, 0]) ** 2
-    if not squares:
-        return Held(math.nan, math.nan, {})
-    px2, m2 = np.mean(list(squares.values()), axis=0)
-    by_name = {name: (math.sqrt(a), math.sqrt(b)) for name, (a, b) in squares.items()}
-    return Held(math.sqrt(px2), math.sqrt(m2), by_name)
-
-
-def side_by_side(problem: Problem, solution: Solution) -> dict[str, dict[str, float] | str]:
-    """Compare every closed form with the refinement: distance from it (m, rad) and rms reprojection (px)."""
-    part = problem.subset(solution.used)
-    out: dict[str, dict[str, float] | str] = {}
-    for method in METHODS:
-        try:
-            mounts = closed_form(method, part.views[0].setup, part.A, part.free)
-        except OpenArmError as error:
-            out[method] = error.message
-            continue
-        offset, angle = mount_error(mounts.X, solution.estimate.X[0])
-        px = _rms(part, mounts.X[None], mounts.Z[None])
-        out[method] = {"translation": offset, "rotation": angle, "px": px}
-    out["REFINED"] = {"translation": 0.0, "rotation": 0.0, "px": _rms(part, solution.estimate.X, solution.estimate.Z)}
-    return out
-
-
-def _rms(problem: Problem, X: Array, Z: Array) -> float:
-    return float(np.sqrt(np.mean(np.concatenate(residuals(problem, X, Z)) ** 2)))
+    closed_form: str = ""
 
 
 def estimate_delay(samples: SampleSet, config: SolveConfig | None = None, rounds: int = 4) -> tuple[float, float]:
@@ -179,6 +121,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
     focal, focal_sigma = 1.0, math.inf
     if "focal length" in alternatives:
         focal, focal_sigma = _focal(alternatives["focal length"].estimate, problem.intrinsics[0])
+    better = rival(problem, solution, one_out)
     true_t, true_r = accuracy(solution, limits)
     poses = len(np.unique(problem.pose[solution.used]))
     figures: dict[str, Any] = {
@@ -187,7 +130,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         "px": now.noise.px, "misfit_px": now.noise.misfit_px(float(np.mean(part.marks))),
         "robot_translation": solution.estimate.noise.translation, "robot_rotation": solution.estimate.noise.rotation,
         "condition": solution.condition, "samples": poses,
-        "reprojection_px": _rms(problem.subset(solution.used), solution.estimate.X, solution.estimate.Z),
+        "reprojection_px": reprojection_rms(part, now.X, now.Z),
         "leave_one_out_px": one_out.px, "leave_one_out": one_out.metres,
         "five_fold_px": folds.px, "five_fold": folds.metres,
         "scale": scale, "scale_sigma": scale_sigma, "focal": focal, "focal_sigma": focal_sigma,
@@ -222,6 +165,9 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         allowed = max(cause.translation / limits.translation, cause.rotation / limits.rotation)
         # what moves the mount by more than the grade allows is a failure, however sure the answer is of itself
         checks.insert(0, Check(cause.name, _FAIL + allowed if allowed > 1.0 else allowed, cause.sentence))
+    if better is not None:
+        # an answer of last resort: never a pass
+        checks.append(Check("closed form", 2.0, better.sentence))
     if stored is not None:
         offset, angle = mount_error(solution.estimate.X[0], stored)
         figures |= {"drift": offset, "drift_rotation": angle}
@@ -231,7 +177,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
     reasons = tuple(check.text for check in checks if check.ratio > 1.0)
     worst = max(check.ratio for check in checks)
     grade: Grade = "fail" if worst > _FAIL else "warn" if worst > 1.0 else "pass"
-    return Verdict(grade, reasons, figures, tuple(checks))
+    return Verdict(grade, reasons, figures, tuple(checks), "" if better is None else better.method)
 
 
 def _focal(estimate: Estimate, stated: Intrinsics) -> tuple[float, float]:

@@ -24,6 +24,7 @@ from openarm_calibration.handeye.kinematics import Kinematics, Posture
 from openarm_calibration.handeye.problem import View, assemble, layout
 from openarm_calibration.handeye.refine import Priors
 from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
+from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
@@ -119,7 +120,9 @@ class ZerosResult:
             elif told:
                 out.append(f"{name}: {figure}")
             else:
-                out.append(f"{name}: {figure}; these views can't tell it from a mount or another joint: the prior decides")
+                out.append(
+                    f"{name}: {figure}; these views can't tell it from a mount or another joint: the prior decides"
+                )
         return tuple(out)
 
 
@@ -188,9 +191,7 @@ def solve_zeros(
     names, prior = _parameters(description, views, config)
     chains = {ends: Kinematics(description, *ends, names) for ends in {(view.base, view.tip) for view in views}}
     values = np.zeros(len(names))
-    armed = [
-        replace(view.view, arm=Posture(chains[view.base, view.tip], view.q, view.torque)) for view in views
-    ]
+    armed = [replace(view.view, arm=Posture(chains[view.base, view.tip], view.q, view.torque)) for view in views]
     problem = assemble(armed, intrinsics, [view.guess for view in views]).posed(np.zeros(len(names)))
     solver = config.solver.model_copy(update={"extras": (*config.solver.extras, "zeros")})
     priors = Priors(zeros=prior)
@@ -203,3 +204,34 @@ def solve_zeros(
     columns = layout(solution.problem, estimate.extras)["zeros"]
     covariance = covariance[columns, columns]
     return ZerosResult(names, values, covariance, prior, solution)
+
+
+def arm_views(sessions: Sequence[SampleSet]) -> tuple[tuple[ArmView, ...], tuple[Intrinsics, ...]]:
+    """Return the views of sessions, and the intrinsics of their cameras, as `solve_zeros` takes them.
+
+    Sessions of one camera on the same link share its mount; each session has a board of its own.
+
+    Args:
+        sessions: Of one robot, of any cameras and arms.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for sessions of different robots, or of one camera with different intrinsics.
+    """
+    robots = sorted({samples.head.robot for samples in sessions if samples.head.robot})
+    if len(robots) > 1:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, f"sessions of {', '.join(robots)}; joints have the same zeros in one robot only"
+        )
+    mounts: dict[tuple[str, str], Intrinsics] = {}
+    out: list[ArmView] = []
+    for board, samples in enumerate(sessions):
+        place = samples.head.camera, samples.head.parent
+        if mounts.setdefault(place, samples.head.optics) != samples.head.optics:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"sessions of camera {place[0]!r} with different intrinsics; solve them apart"
+            )
+        chain = samples.kinematics(())
+        for sample, view in zip(samples.samples, samples.problem().views, strict=True):
+            numbered = replace(view, camera=list(mounts).index(place), board=board, pose=len(out))
+            out.append(ArmView(numbered, chain.base, chain.tip, sample.joints, sample.T_camera_board))
+    return tuple(out), tuple(mounts.values())

@@ -29,6 +29,7 @@ from pydantic import Field, field_validator
 
 from openarm_calibration.board.board import Board, parse_board
 from openarm_calibration.board.detect import BoardDetection, guess_pose
+from openarm_calibration.handeye.kinematics import Kinematics, Posture
 from openarm_calibration.handeye.problem import Problem, View, assemble
 from openarm_calibration.handeye.transforms import difference
 from openarm_common import se3
@@ -57,6 +58,7 @@ class SessionHead(Config):
     board: dict[str, Any] = Field(description="keys of the board")
     mount_seed: int | None = Field(default=None, description="of the simulated mounts")
     created: str = Field(default="", description="when, as ISO 8601")
+    robot: str = Field(default="", description="name of the robot; empty in sessions of older versions")
 
     @field_validator("intrinsics")
     @classmethod
@@ -197,6 +199,12 @@ class SampleSet:
             return se3.inverse(link(self.head.base, joints)) @ link(self.head.parent, joints)
         return se3.inverse(link(self.head.parent, joints)) @ link(self.head.carrier, joints)
 
+    def kinematics(self, parameters: tuple[str, ...]) -> Kinematics:
+        """Return what turns joint positions into A, with these parameters (see `Kinematics`)."""
+        head = self.head
+        base, tip = (head.base, head.parent) if head.setup == "in_hand" else (head.parent, head.carrier)
+        return Kinematics(self._description, base, tip, parameters)
+
     def pose_at(self, sample: Sample, t_ns: int) -> Array:
         """Return A (4, 4) at a stamp near a sample's, by its track; at the sample's own joints without one."""
         times = [t for t, _ in sample.track]
@@ -216,6 +224,7 @@ class SampleSet:
         if not self._samples:
             raise OpenArmError(Code.DEGENERATE, "too few poses: no samples; take at least 3, better 10 to 15")
         views: list[View] = []
+        kinematics = self.kinematics(self.joint_names)
         for k, sample in enumerate(self._samples):
             t_ns = sample.t_image_ns - round(delay_s * 1e9)
             early, late = (self.pose_at(sample, t_ns + step) for step in (-_RATE_STEP_NS, _RATE_STEP_NS))
@@ -223,7 +232,7 @@ class SampleSet:
             rate = difference(early, late) / (2e-9 * _RATE_STEP_NS)
             points = self.board.points[sample.detection.ids]
             view = View(points, sample.detection.pixels, A, self.head.setup, self.board.radius, pose=k, rate=rate)
-            views.append(replace(view, name=sample.name))
+            views.append(replace(view, name=sample.name, arm=Posture(kinematics, sample.joints)))
         return assemble(views, [self.head.optics], [sample.T_camera_board for sample in self._samples])
 
     # --- session file
@@ -286,7 +295,7 @@ def head_of(
         carrier = last.flange
     return SessionHead(
         camera=camera, setup="in_hand" if moves else "to_hand", parent=parent, carrier=parent if moves else carrier,
-        intrinsics=astuple(optics), board=board.model_dump(), **more,
+        intrinsics=astuple(optics), board=board.model_dump(), robot=description.name, **more,
     )  # fmt: skip
 
 

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from openarm_calibration.handeye.left_out import side_by_side
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig, solve
-from openarm_calibration.handeye.verdict import assess, estimate_delay, side_by_side
+from openarm_calibration.handeye.verdict import assess, estimate_delay
 from openarm_calibration.sampling.gate import GateConfig, match
 from openarm_calibration.sampling.samples import load_session
 from openarm_common.errors import Code, OpenArmError
@@ -211,7 +212,7 @@ def test_wrong_intrinsics_fail_by_name_and_right_ones_do_not(session, setup: str
     samples.head = samples.head.model_copy(update={"intrinsics": far})
     with pytest.raises(
         OpenArmError,
-        match=r"poses that contradict each other.*check the joint zeros, the intrinsics",
+        match=r"the focal length seems -16\.\d+ % off.*poses that contradict each other.*the intrinsics",
     ):
         solve(samples.problem())
 

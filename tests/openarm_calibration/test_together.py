@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from openarm_calibration.handeye.offline import calibrate, calibrate_together, join
-from openarm_calibration.handeye.transforms import moved
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig
+from openarm_calibration.handeye.transforms import moved
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import OpenArmError
