@@ -27,9 +27,9 @@ from benchmarks import hand_eye_problems as synthetic
 from benchmarks.report import Row, write_report
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
 from openarm_calibration.handeye.problem import Setup
-from openarm_calibration.handeye.refine import Noise
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.transforms import difference
+from openarm_calibration.handeye.unknowns import Noise
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 

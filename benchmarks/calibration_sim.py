@@ -25,8 +25,8 @@ import numpy as np
 
 from benchmarks.report import Row, write_report
 from openarm_calibration.handeye.offline import calibrate
-from openarm_calibration.handeye.transforms import difference
 from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.handeye.transforms import difference
 from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras, true_mount
 from openarm_evaluation.campaign.mounts import Bench
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, project
-from openarm_calibration.handeye.refine import Noise, information_at
+from openarm_calibration.handeye.refine import information_at
 from openarm_calibration.handeye.transforms import inverses, moved
+from openarm_calibration.handeye.unknowns import Noise
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.types import Array

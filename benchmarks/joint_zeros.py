@@ -23,9 +23,9 @@ from benchmarks.report import Row, write_report
 from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.handeye.marks import project
 from openarm_calibration.handeye.problem import Setup, View
-from openarm_calibration.handeye.refine import Noise
 from openarm_calibration.handeye.solve import SolveConfig
 from openarm_calibration.handeye.transforms import difference, moved
+from openarm_calibration.handeye.unknowns import Noise
 from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, solve_zeros
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras, true_mount
@@ -191,8 +191,9 @@ def main() -> None:
     for name, values in nees.items():
         print(f"nees {name:24s} {np.mean(values):.2f}")
     worst = max((float(np.mean(values)) for values in nees.values()), key=lambda value: abs(value - 6.0))
+    rms_seen = math.degrees(np.sqrt(np.mean(np.square(seen_errors))))
     rows = [
-        Row("zeros_rms", math.degrees(np.sqrt(np.mean(np.square(seen_errors)))), "deg", "lower", 0.05, n=len(seen_errors)),
+        Row("zeros_rms", rms_seen, "deg", "lower", 0.05, n=len(seen_errors)),
         Row("zeros_nees", worst, "", "in 5..7", 6.0, n=sets),
         Row("zeros_solve", float(np.median(seconds)), "s", "lower", None, n=sets),
     ]  # fmt: skip

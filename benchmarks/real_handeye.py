@@ -6,7 +6,7 @@
 FOLDER holds a JSON file for each set, in SI units: `camera` (width, height, K), `setup` (eye_in_hand or eye_to_hand),
 `chain` (base and tip link), and `samples`, each with `T_base_tip`, `corners_px`, `corners_board_m`, and, where joint
 zeros can be estimated, `joint_positions`. Nobody knows the true mounts: each view is left out in turn and predicted
-by the answer of the others, in px, and in mm and degrees against the pose of its own corners at the answer's intrinsics.
+by the answer of the others, in px, and in mm and degrees against the pose of its own corners.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from benchmarks.report import Row, write_report
 from openarm_calibration.board.detect import guess_pose
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
 from openarm_calibration.handeye.kinematics import Kinematics
-from openarm_calibration.handeye.marks import fit_poses, project
+from openarm_calibration.handeye.marks import Indices, fit_poses, project
 from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, chain
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, solve_zeros
@@ -39,6 +39,7 @@ from openarm_common.types import Array
 
 _SETUPS: dict[str, Setup] = {"eye_in_hand": "in_hand", "eye_to_hand": "to_hand"}
 _LAX = SolveConfig(most_translation=10.0, most_rotation=10.0)
+_BEFORE = _LAX.model_copy(update={"misfit": False})
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ def read_set(path: Path) -> RealSet:
         )
         guesses.append(guess_pose(points, pixels, 0.0, optics)[0])
     arm = tuple(
-        ArmView(view, *data["chain"], sample["joint_positions"], guess)
+        ArmView(view, data["chain"][0], data["chain"][1], sample["joint_positions"], guess)
         for view, sample, guess in zip(views, data["samples"], guesses, strict=True)
         if sample.get("joint_positions")
     )
@@ -93,25 +94,25 @@ def _poses(problem: Problem, X: Array, Z: Array) -> Array:
     return chain(problem, X[None] if X.ndim == 2 else X, Z[None] if Z.ndim == 2 else Z)[0]
 
 
-def fit_closed(real: RealSet, keep: Array, method: str) -> Fit:
+def fit_closed(real: RealSet, keep: Indices, method: str) -> Fit:
     """Answer with a closed form of the views `keep`."""
     part = real.problem.subset(keep)
     mounts = closed_form(method, real.setup, part.A, part.free)
     return Fit(_poses(real.problem, mounts.X, mounts.Z), np.zeros((1, 6)))
 
 
-def fit_solver(real: RealSet, keep: Array, config: SolveConfig) -> Fit:
+def fit_solver(real: RealSet, keep: Indices, config: SolveConfig) -> Fit:
     """Answer with the solver."""
     estimate = solve(real.problem.subset(keep), config).estimate
     return Fit(_poses(real.problem, estimate.X, estimate.Z), estimate.optics)
 
 
-def zeros_of(real: RealSet, keep: Array, description: RobotDescription) -> ZerosResult:
+def zeros_of(real: RealSet, keep: Indices, description: RobotDescription) -> ZerosResult:
     """Return the zeros by the views `keep`."""
     return solve_zeros(description, [real.arm[i] for i in keep], real.problem.intrinsics, ZerosConfig(solver=_LAX))
 
 
-def fit_zeros(real: RealSet, keep: Array, description: RobotDescription) -> Fit:
+def fit_zeros(real: RealSet, keep: Indices, description: RobotDescription) -> Fit:
     """Answer with zeros."""
     found = zeros_of(real, keep, description)
     first = real.arm[0]
@@ -121,7 +122,7 @@ def fit_zeros(real: RealSet, keep: Array, description: RobotDescription) -> Fit:
     return Fit(_poses(replace(real.problem, A=A), estimate.X, estimate.Z), estimate.optics)
 
 
-def left_out(real: RealSet, fit: Callable[[Array], Fit]) -> Array:
+def left_out(real: RealSet, fit: Callable[[Indices], Fit]) -> Array:
     """Return (n, 3) errors of each view, predicted by the others: px rms, m at the board's centre, rad."""
     problem = real.problem
     out: list[tuple[float, float, float]] = []
@@ -129,7 +130,7 @@ def left_out(real: RealSet, fit: Callable[[Array], Fit]) -> Array:
         try:
             found = fit(np.array([k for k in range(len(problem)) if k != i]))
         except OpenArmError:
-            out.append((math.nan,) * 3)
+            out.append((math.nan, math.nan, math.nan))
             continue
         row = problem.camera_rows(found.optics)[i]
         T = found.T[i]
@@ -170,11 +171,10 @@ def main() -> None:
     for path in sorted(arguments.folder.glob("*.json")):
         real = read_set(path)
         print(f"{real.name}: {len(real.problem)} views, {real.setup}")
-        answers: dict[str, Callable[[Array], Fit]] = {
+        answers: dict[str, Callable[[Indices], Fit]] = {
             method: lambda keep, method=method, real=real: fit_closed(real, keep, method) for method in METHODS
         }
-        before = _LAX.model_copy(update={"misfit": False})
-        answers["without misfit"] = lambda keep, real=real: fit_solver(real, keep, before)
+        answers["without misfit"] = lambda keep, real=real: fit_solver(real, keep, _BEFORE)
         answers["refined"] = lambda keep, real=real: fit_solver(real, keep, _LAX)
         if real.arm:
             answers["refined, zeros"] = lambda keep, real=real: fit_zeros(real, keep, description)

@@ -3,10 +3,11 @@
 
     python -m benchmarks.wrong_input [--sets 50] [--kinds board_size ...] [--json PATH]
 
-Synthetic sets with a known answer (`hand_eye_problems`), marks off by 0.3 px, the robot by 0.2 mm and 0.02° by axis, of 10
-and of 25 views. A set counts as named when the first cause in the verdict, or in the refusal, is what is wrong with it,
-and as silently wrong when its grade would let it be stored with a mount that is off by more than three times the limit of
-a pass and by more than four predicted deviations. `right` are sets without a mistake: named is then the share that passes or warns without a cause.
+Synthetic sets with a known answer (`hand_eye_problems`), marks off by 0.3 px, the robot by 0.2 mm and 0.02° by axis,
+of 10 and of 25 views. A set counts as named when the first cause in the verdict, or in the refusal, is what is wrong
+with it, and as silently wrong when its grade would let it be stored with a mount that is off by more than three times
+the limit of a pass and by more than four predicted deviations. `right` are sets without a mistake: named is then the
+share that passes or warns without a cause.
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ from benchmarks.hand_eye_problems import Truth
 from benchmarks.report import Row, write_report
 from openarm_calibration.board.detect import guess_pose
 from openarm_calibration.handeye.problem import Problem, Setup, assemble
-from openarm_calibration.handeye.refine import Noise, mount_error
+from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import solve
 from openarm_calibration.handeye.transforms import inverses, moved
+from openarm_calibration.handeye.unknowns import Noise
 from openarm_calibration.handeye.verdict import Limits, assess
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import OpenArmError

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -19,7 +20,8 @@ from scipy.optimize import minimize_scalar
 from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.marks import fit_poses
 from openarm_calibration.handeye.problem import Extra, Problem, chain
-from openarm_calibration.handeye.refine import FREE, Estimate, Noise, Priors, mount_error, pixel_noise, refine
+from openarm_calibration.handeye.refine import mount_error, pixel_noise, refine
+from openarm_calibration.handeye.unknowns import FREE, Estimate, Noise, Priors
 from openarm_calibration.handeye.variants import variants
 from openarm_common.errors import OpenArmError
 from openarm_common.types import Array
@@ -186,7 +188,7 @@ def _other_board(problem: Problem, base: Estimate | None, best_px: float) -> Cau
         return float(_stretched(problem, math.exp(log_ratio)).free_cost.sum())
 
     # bounded: the rows of a board are at most twice as far apart as stated, or half as far
-    best = minimize_scalar(cost, bounds=(-0.7, 0.7), method="bounded", options={"xatol": 1e-5, "maxiter": 40})
+    best: Any = minimize_scalar(cost, bounds=(-0.7, 0.7), method="bounded", options={"xatol": 1e-5, "maxiter": 40})
     longer = _stretched(problem, math.exp(best.x))
     px = pixel_noise(longer)
     if px > 0.9 * pixel_noise(problem):

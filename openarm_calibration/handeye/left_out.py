@@ -15,8 +15,9 @@ import numpy as np
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
 from openarm_calibration.handeye.marks import project
 from openarm_calibration.handeye.problem import Problem, chain, residuals
-from openarm_calibration.handeye.refine import at_zeros, mount_error, refine
+from openarm_calibration.handeye.refine import mount_error, refine
 from openarm_calibration.handeye.solve import Solution
+from openarm_calibration.handeye.unknowns import at_zeros
 from openarm_common.errors import OpenArmError
 from openarm_common.types import Array
 
@@ -107,7 +108,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
 
 
 def in_space_squares(problem: Problem, T: Array) -> Array:
-    """Return (n,) mean squared distances of the marks at poses T (n, 4, 4) from where the views by themselves have them, m²."""
+    """Return (n,) mean squared distances of the marks at poses T (n, 4, 4) from those at each view's own pose, m²."""
     out = np.zeros(len(problem))
     for k, view in enumerate(problem.views):
         away = view.points @ (T[k, :3, :3] - problem.free[k, :3, :3]).T + T[k, :3, 3] - problem.free[k, :3, 3]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openarm_calibration.handeye.problem import Problem
-from openarm_calibration.handeye.refine import Estimate, Noise
+from openarm_calibration.handeye.unknowns import Estimate, Noise
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array

@@ -19,8 +19,9 @@ from openarm_calibration.handeye.closed_form import ALGORITHMS, METHODS, REFINED
 from openarm_calibration.handeye.left_out import side_by_side
 from openarm_calibration.handeye.observability import condition_number, require_motion
 from openarm_calibration.handeye.problem import Problem, View, assemble
-from openarm_calibration.handeye.refine import Estimate, invert_scaled, mount_error
+from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import Outlier, Solution, SolveConfig, solve
+from openarm_calibration.handeye.unknowns import Estimate, invert_scaled
 from openarm_calibration.handeye.verdict import Limits, Verdict, assess
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_calibration.store.store import StoredCalibration

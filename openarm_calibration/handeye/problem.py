@@ -151,7 +151,7 @@ class Problem:
         return _pack(views, self.intrinsics, self.free[chosen], self.free_cost[chosen])
 
     def posed(self, zeros: Array) -> Problem:
-        """Return the same views with the robot poses that follow from the joints, at offsets (joints,) of their zeros."""
+        """Return the views with the robot poses that follow from the joints at offsets (joints,) of their zeros."""
         found = [view.arm.at(zeros) for view in self.views if view.arm is not None]
         if len(found) < len(self):
             return self

@@ -23,7 +23,8 @@ from openarm_calibration.handeye.causes import diagnose, freed
 from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.observability import FEWEST, condition_number, require_accuracy, require_motion
 from openarm_calibration.handeye.problem import Extra, Problem, chain, design
-from openarm_calibration.handeye.refine import FREE, Estimate, Noise, Priors, at_zeros, pixel_noise, refine
+from openarm_calibration.handeye.refine import pixel_noise, refine
+from openarm_calibration.handeye.unknowns import FREE, Estimate, Noise, Priors, at_zeros
 from openarm_common import se3
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError

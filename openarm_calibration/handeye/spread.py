@@ -107,6 +107,16 @@ def criterion(
 def search(
     full: Array, KMK: Array, both: Array, start_t: float, start_r: float, whole: bool
 ) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Search for the most likely spread of the robot, m and rad.
+
+    Args:
+        full: As `criterion`.
+        KMK: As `criterion`.
+        both: As `criterion`.
+        start_t: Where to start, m.
+        start_r: The same, rad.
+        whole: Whether to look everywhere, instead of near the start.
+    """
     best_t, best_r = max(start_t, 1e-7), max(start_r, 1e-7)
     best = criterion(full, KMK, both, best_t, best_r)
     if whole:

@@ -140,7 +140,7 @@ def _unwound(problem: Problem) -> Array:
     n, k = candidates.shape
     R = Rotation.from_rotvec((candidates[:, :, None] * axis[:, None]).reshape(-1, 3)).as_matrix().reshape(n, k, 9)
     seen = np.cos(angles_between(problem.free[:, :3, :3]))
-    best, lowest = np.zeros(n, dtype=np.int64), math.inf
+    best, lowest, cost = np.zeros(n, dtype=np.int64), math.inf, np.zeros((n, k))
     for first in np.flatnonzero(inside[0]):
         against = (R @ R[0, first] - 1.0) / 2.0  # (n, k)
         away = np.where(inside, np.abs(against - seen[0][:, None]), np.inf)
@@ -161,7 +161,7 @@ def _unwound(problem: Problem) -> Array:
 
 
 def _order(problem: Problem) -> Indices | None:
-    """Return which pose (n,) belongs to each view by the angles to all others; None where they are in order, or unclear."""
+    """Return which pose (n,) belongs to each view by the angles to all others; None: in order, or unclear."""
     robot, camera = angles_between(problem.A[:, :3, :3]), angles_between(problem.free[:, :3, :3])
     cost = np.abs(np.sort(camera, axis=1)[:, None] - np.sort(robot, axis=1)[None]).mean(axis=2)
     _, order = linear_sum_assignment(cost)

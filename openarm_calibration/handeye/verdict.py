@@ -16,9 +16,10 @@ from pydantic import Field
 from openarm_calibration.handeye.causes import diagnose, freed
 from openarm_calibration.handeye.left_out import held_out, reprojection_rms, rival
 from openarm_calibration.handeye.problem import Problem
-from openarm_calibration.handeye.refine import Estimate, Priors, mount_error, refine
+from openarm_calibration.handeye.refine import mount_error, refine
 from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
 from openarm_calibration.handeye.transforms import difference
+from openarm_calibration.handeye.unknowns import Estimate, Priors
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config
@@ -181,7 +182,9 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
 
 
 def _focal(estimate: Estimate, stated: Intrinsics) -> tuple[float, float]:
-    """Return the focal length over the stated one where it is free, and its deviation; of fx and fy the one farther off.
+    """Return the focal length over the stated one where it is free, and its deviation.
+
+    Of fx and fy the one farther off.
 
     Args:
         estimate: With free intrinsics.

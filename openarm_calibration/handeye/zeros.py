@@ -22,8 +22,8 @@ from pydantic import Field
 
 from openarm_calibration.handeye.kinematics import Kinematics, Posture
 from openarm_calibration.handeye.problem import View, assemble, layout
-from openarm_calibration.handeye.refine import Priors
 from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
+from openarm_calibration.handeye.unknowns import Priors
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config
@@ -120,9 +120,7 @@ class ZerosResult:
             elif told:
                 out.append(f"{name}: {figure}")
             else:
-                out.append(
-                    f"{name}: {figure}; these views can't tell it from a mount or another joint: the prior decides"
-                )
+                out.append(f"{name}: {figure}; no view tells it from a mount or another joint: the prior decides")
         return tuple(out)
 
 
@@ -182,8 +180,8 @@ def solve_zeros(
         config: Priors.
 
     Raises:
-        OpenArmError: DEGENERATE, when the views determine no mount; INVALID_ARGUMENT, for no view, or a prior of a joint
-            that moves nothing.
+        OpenArmError: DEGENERATE, when the views determine no mount; INVALID_ARGUMENT, for no view, or a prior of a
+            joint that moves nothing.
     """
     config = config or ZerosConfig()
     if not views:

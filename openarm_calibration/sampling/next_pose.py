@@ -20,9 +20,10 @@ from pydantic import Field
 from openarm_calibration.board.board import Board
 from openarm_calibration.handeye.observability import UNITS, motion
 from openarm_calibration.handeye.problem import View, assemble, project
-from openarm_calibration.handeye.refine import Noise, information_at, invert_scaled, mount_error
+from openarm_calibration.handeye.refine import information_at, mount_error
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.transforms import inverses
+from openarm_calibration.handeye.unknowns import Noise, invert_scaled
 from openarm_calibration.sampling.bodies import Bodies, chain_poses
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common import se3

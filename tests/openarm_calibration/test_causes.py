@@ -17,9 +17,10 @@ from benchmarks.wrong_input import KINDS, NOISE, Tally, judge
 from openarm_calibration.handeye.left_out import held_out, rival
 from openarm_calibration.handeye.marks import normal_equations, project
 from openarm_calibration.handeye.problem import assemble
-from openarm_calibration.handeye.refine import Noise, mount_error
+from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import solve
 from openarm_calibration.handeye.transforms import moved
+from openarm_calibration.handeye.unknowns import Noise
 from openarm_calibration.handeye.verdict import Limits, accuracy, assess
 from openarm_common import se3
 
@@ -81,7 +82,7 @@ def bent(truth: synthetic.Truth, px: float, rng: np.random.Generator) -> synthet
 
 
 def test_what_the_marks_of_a_view_share_is_told_from_the_robots_errors() -> None:
-    """An exact robot with bent boards: a misfit, no robot; a bad robot with flat ones: the reverse; both in px and m."""
+    """An exact robot with bent boards has a misfit, a bad robot with flat ones has none."""
     rng = np.random.default_rng(34)
     board = solve(bent(synthetic.trial("to_hand", 20, Noise(0.1), rng), 0.8, rng).problem).estimate.noise
     assert board.misfit_px(44) == pytest.approx(0.8, rel=0.35)

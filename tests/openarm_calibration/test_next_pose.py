@@ -12,7 +12,8 @@ from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.board.detect import BoardDetection
 from openarm_calibration.handeye.observability import UNITS
 from openarm_calibration.handeye.problem import project
-from openarm_calibration.handeye.refine import Noise, information_at, mount_error
+from openarm_calibration.handeye.refine import information_at, mount_error
+from openarm_calibration.handeye.unknowns import Noise
 from openarm_calibration.sampling.next_pose import PoseSearch, SearchConfig, advice
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3

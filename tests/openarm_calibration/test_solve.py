@@ -11,9 +11,10 @@ import pytest
 from benchmarks import hand_eye_problems as synthetic
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
 from openarm_calibration.handeye.problem import View, assemble
-from openarm_calibration.handeye.refine import Noise, mount_error, pixel_noise
+from openarm_calibration.handeye.refine import mount_error, pixel_noise
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.transforms import difference, moved
+from openarm_calibration.handeye.unknowns import Noise
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 

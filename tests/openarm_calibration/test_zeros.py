@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from benchmarks.joint_zeros import groups, solved, trial
 from openarm_calibration.handeye.kinematics import Kinematics
-from openarm_calibration.handeye.refine import Noise
 from openarm_calibration.handeye.solve import SolveConfig
 from openarm_calibration.handeye.transforms import difference
+from openarm_calibration.handeye.unknowns import Noise
 from openarm_calibration.handeye.zeros import ZerosConfig, arm_views, solve_zeros
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
@@ -45,7 +45,7 @@ def test_derivatives_of_the_kinematics_agree_with_differences(values: list[float
 
 @pytest.mark.requirement("A-36")
 def test_zeros_of_both_arms_are_found_to_0_05_degrees_and_what_a_mount_takes_up_is_said() -> None:
-    """Off by 1° by joint; three sets of two cameras. Errors are those that were predicted (the benchmark has 200 sets)."""
+    """Off by 1° by joint; three sets of two cameras. The benchmark has 200 sets."""
     nees = []
     for seed in range(2):
         made = trial(ROBOT, np.random.default_rng([1, seed]), count=12)
