@@ -24,7 +24,7 @@ from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.handeye.marks import project
 from openarm_calibration.handeye.problem import Setup, View
 from openarm_calibration.handeye.solve import SolveConfig
-from openarm_calibration.handeye.transforms import difference, moved
+from openarm_calibration.handeye.transforms import moved, skews
 from openarm_calibration.handeye.unknowns import Noise
 from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, solve_zeros
 from openarm_common import se3
@@ -138,6 +138,15 @@ def solved(description: RobotDescription, made: Trial, sigma: float = OFF) -> Ze
     return solve_zeros(description, made.views, [known[name].intrinsics for name in made.cameras], config)
 
 
+def _twist(T: Array) -> Array:
+    """Return the twist (6,) whose exponential is a transform: translation, rotation."""
+    w = se3.log_so3(T[:3, :3])
+    angle = max(float(np.linalg.norm(w)), 1e-9)
+    K = skews(w)
+    V = np.eye(3) + (1.0 - math.cos(angle)) / angle**2 * K + (angle - math.sin(angle)) / angle**3 * K @ K
+    return np.concatenate([np.linalg.solve(V, T[:3, 3]), w]).astype(np.float64)
+
+
 def groups(found: ZerosResult, made: Trial) -> dict[str, float]:
     """Return the normalised square of the error of groups of six."""
     estimate = found.solution.estimate
@@ -148,7 +157,11 @@ def groups(found: ZerosResult, made: Trial) -> dict[str, float]:
         out[name] = float(error @ np.linalg.solve(covariance[np.ix_(columns, columns)], error))
 
     for k, camera in enumerate(made.cameras):
-        add(f"mount_{camera}", difference(estimate.X[k], made.X[k]), list(range(6 * k, 6 * k + 6)))
+        # a turn about the first or last joint moves the mount along a circle: counted as a twist, in which it is linear
+        block, X = slice(6 * k, 6 * k + 6), estimate.X[k]
+        to_twist = np.block([[np.eye(3), skews(X[:3, 3]) @ X[:3, :3]], [np.zeros((3, 3)), X[:3, :3]]])
+        twist = _twist(made.X[k] @ se3.inverse(X))
+        out[f"mount_{camera}"] = float(twist @ np.linalg.solve(to_twist @ covariance[block, block] @ to_twist.T, twist))
     away = dict(zip(found.names, found.values - [made.zeros[name] for name in found.names], strict=True))
     for arm in ("right", "left"):
         names = [name for name in found.names if f"_{arm}_" in name][1:]

@@ -20,10 +20,10 @@ from openarm_common.lazy import attach
 if TYPE_CHECKING:
     from openarm_calibration.board.board import Charuco as Charuco
     from openarm_calibration.board.board import CircleGrid as CircleGrid
+    from openarm_calibration.handeye.limits import Limits as Limits
     from openarm_calibration.handeye.offline import Result as Result
     from openarm_calibration.handeye.offline import calibrate as calibrate
     from openarm_calibration.handeye.offline import calibrate_together as calibrate_together
-    from openarm_calibration.handeye.verdict import Limits as Limits
     from openarm_calibration.ros.client import CalibrationClient as CalibrationClient
     from openarm_calibration.sampling.next_pose import PoseSearch as PoseSearch
     from openarm_calibration.sampling.samples import SampleSet as SampleSet

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from openarm_calibration.handeye.closed_form import ALGORITHMS
-from openarm_calibration.handeye.verdict import Limits
+from openarm_calibration.handeye.limits import Limits
 from openarm_calibration.sampling.gate import GateConfig
 from openarm_calibration.sampling.next_pose import SearchConfig
 from openarm_calibration.store.store import StoreConfig

@@ -24,7 +24,7 @@ HAND_EYE = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
 #: AX = ZB: both mounts at once.
 ROBOT_WORLD = ("SHAH", "LI")
 METHODS = (*HAND_EYE, *ROBOT_WORLD)
-#: The refinement, and all that a stored mount may be of.
+#: What a calibration may be of.
 REFINED = "REFINED"
 ALGORITHMS = (REFINED, *METHODS)
 
@@ -49,6 +49,17 @@ def require_opencv() -> None:
             Code.ENVIRONMENT,
             f"OpenCV {cv2.__version__} has no calibrateHandEye; install opencv-python-headless >= 4.13, < 5",
         )
+
+
+def checked_algorithm(name: str) -> str:
+    """Return the method's proper name.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, listing the methods.
+    """
+    if name.upper() not in ALGORITHMS:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"no algorithm {name!r}; algorithms: {', '.join(ALGORITHMS)}")
+    return name.upper()
 
 
 def closed_form(method: str, setup: Setup, A: Array, C: Array) -> Mounts:

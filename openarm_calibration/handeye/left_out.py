@@ -16,8 +16,7 @@ from openarm_calibration.handeye.closed_form import METHODS, closed_form
 from openarm_calibration.handeye.marks import project
 from openarm_calibration.handeye.problem import Problem, chain, residuals
 from openarm_calibration.handeye.refine import mount_error, refine
-from openarm_calibration.handeye.solve import Solution
-from openarm_calibration.handeye.unknowns import at_zeros
+from openarm_calibration.handeye.unknowns import Solution, at_zeros
 from openarm_common.errors import OpenArmError
 from openarm_common.types import Array
 

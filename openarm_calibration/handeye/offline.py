@@ -15,13 +15,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from openarm_calibration.handeye.closed_form import ALGORITHMS, METHODS, REFINED, closed_form
+from openarm_calibration.handeye.closed_form import REFINED, checked_algorithm, closed_form
 from openarm_calibration.handeye.left_out import side_by_side
 from openarm_calibration.handeye.observability import condition_number, require_motion
 from openarm_calibration.handeye.problem import Problem, View, assemble
 from openarm_calibration.handeye.refine import mount_error
-from openarm_calibration.handeye.solve import Outlier, Solution, SolveConfig, solve
-from openarm_calibration.handeye.unknowns import Estimate, invert_scaled
+from openarm_calibration.handeye.solve import SolveConfig, solve
+from openarm_calibration.handeye.unknowns import Estimate, Outlier, Solution, invert_scaled
 from openarm_calibration.handeye.verdict import Limits, Verdict, assess
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_calibration.store.store import StoredCalibration
@@ -60,17 +60,6 @@ class Result:
             "intrinsics": asdict(self.solution.problem.intrinsics[0]),
             "calibration": self.calibration.model_dump(mode="json"),
         }
-
-
-def checked_algorithm(name: str) -> str:
-    """Return the method's proper name.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, listing the methods.
-    """
-    if name.upper() not in ALGORITHMS:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"no algorithm {name!r}; algorithms: {', '.join(ALGORITHMS)}")
-    return name.upper()
 
 
 def calibrate(

@@ -12,7 +12,7 @@ import numpy as np
 from openarm_calibration.handeye.problem import Extra, Problem, layout
 from openarm_calibration.handeye.spread import FLOOR
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.types import Array
+from openarm_common.types import Array, Mask
 
 
 @dataclass(frozen=True)
@@ -200,3 +200,62 @@ def invert_scaled(information: Array) -> Array:
     if values[0] <= 1e-14 * values[-1]:
         raise OpenArmError(Code.DEGENERATE, "the views leave an unknown free; add poses that differ in rotation")
     return (vectors / values) @ vectors.T / np.outer(scale, scale)
+
+
+@dataclass(frozen=True)
+class PoseTest:
+    """One robot pose (all views taken at it) against the others.
+
+    Args:
+        distance: Squared distance by number of measurements, in units of what is expected (1 is usual).
+        limit: Above it the pose contradicts the others.
+        influence: How far the answer moves without it, in standard deviations of the answer (Cook).
+        translation: Contradiction of the worst view, m at the board.
+        rotation: The same, rad.
+    """
+
+    distance: float
+    limit: float
+    influence: float
+    translation: float
+    rotation: float
+
+
+@dataclass(frozen=True, eq=False)
+class Outlier:
+    """A view that was left out."""
+
+    name: str
+    index: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Mounts and the data they are computed from.
+
+    Args:
+        problem: All views.
+        used: (n,) which views the estimate rests on.
+        estimate: The refinement.
+        outliers: The other views, with reasons.
+        tests: Each robot pose against the prediction of the others.
+        condition: Condition number of the information, in units of 1 mm and 0.1°.
+    """
+
+    problem: Problem
+    used: Mask
+    estimate: Estimate
+    outliers: tuple[Outlier, ...]
+    tests: tuple[PoseTest, ...]
+    condition: float
+
+    def mount_covariance(self, camera: int = 0) -> Array:
+        """(6, 6) covariance of a camera's mount: position in the parent's axes (m), rotation in its own (rad)."""
+        block = slice(6 * camera, 6 * camera + 6)
+        return self.estimate.covariance()[block, block]
+
+    def sigma(self, camera: int = 0) -> tuple[float, float]:
+        """Predicted error of a camera's mount: standard deviation of position (m) and rotation (rad) as vectors."""
+        covariance = self.mount_covariance(camera)
+        return math.sqrt(np.trace(covariance[:3, :3])), math.sqrt(np.trace(covariance[3:, 3:]))

@@ -11,37 +11,22 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from openarm_calibration.handeye.causes import diagnose, freed
 from openarm_calibration.handeye.left_out import held_out, reprojection_rms, rival
+from openarm_calibration.handeye.limits import Limits
 from openarm_calibration.handeye.problem import Problem
 from openarm_calibration.handeye.refine import mount_error, refine
-from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
+from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.transforms import difference
-from openarm_calibration.handeye.unknowns import Estimate, Priors
+from openarm_calibration.handeye.unknowns import Estimate, Priors, Solution
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.config import Config
 from openarm_common.types import Array
 
 Grade = Literal["pass", "warn", "fail"]
 #: Ratio to a limit beyond which a calibration fails.
 _FAIL = 3.0
-
-
-class Limits(Config):
-    """When a calibration passes; beyond three times a limit it fails, between the two it is a warning."""
-
-    translation: float = Field(default=0.5e-3, gt=0.0, description="predicted error of the position, m")
-    rotation: float = Field(default=math.radians(0.05), gt=0.0, description="predicted error of the rotation, rad")
-    held_out: float = Field(default=1e-3, gt=0.0, description="rms error at the board of poses that were left out, m")
-    focal_known: float = Field(default=0.003, gt=0.0, description="deviation of a camera's stated focal length")
-    centre_known: float = Field(default=3.0, gt=0.0, description="the same of its principal point, px")
-    distortion_known: float = Field(default=0.01, gt=0.0, description="the same of its distortion, k1 and k2")
-    robot: float = Field(default=math.radians(0.1), gt=0.0, description="spread of the hand's rotations, rad")
-    samples: int = Field(default=10, ge=3, description="fewer are a warning")
-    drift: float = Field(default=2e-3, gt=0.0, description="distance from the stored calibration, m")
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from pydantic import Field
 
 from openarm_calibration.handeye.kinematics import Kinematics, Posture
 from openarm_calibration.handeye.problem import View, assemble, layout
-from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
-from openarm_calibration.handeye.unknowns import Priors
+from openarm_calibration.handeye.solve import SolveConfig, solve
+from openarm_calibration.handeye.unknowns import Priors, Solution
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config

@@ -30,8 +30,8 @@ from openarm_interfaces.srv import (
 from openarm_calibration.board.board import read_board
 from openarm_calibration.board.detect import BoardDetection, detect
 from openarm_calibration.config import CalibrationConfig
-from openarm_calibration.handeye.closed_form import ALGORITHMS
-from openarm_calibration.handeye.offline import Result, calibrate, checked_algorithm
+from openarm_calibration.handeye.closed_form import ALGORITHMS, checked_algorithm
+from openarm_calibration.handeye.offline import Result, calibrate
 from openarm_calibration.ros.auto_server import AutoCalibrateServer, fill
 from openarm_calibration.ros.image_capture import ImageCapture, grey
 from openarm_calibration.sampling.gate import Matched, match

@@ -21,7 +21,7 @@ from openarm_calibration.board.board import Board
 from openarm_calibration.handeye.observability import UNITS, motion
 from openarm_calibration.handeye.problem import View, assemble, project
 from openarm_calibration.handeye.refine import information_at, mount_error
-from openarm_calibration.handeye.solve import SolveConfig, solve
+from openarm_calibration.handeye.robust import SolveConfig, solve_robustly
 from openarm_calibration.handeye.transforms import inverses
 from openarm_calibration.handeye.unknowns import Noise, invert_scaled
 from openarm_calibration.sampling.bodies import Bodies, chain_poses
@@ -173,7 +173,7 @@ class PoseSearch:
         B = se3.inverse(A) if samples.head.setup == "in_hand" else A
         before = Belief(self._nominal, se3.inverse(B) @ self._nominal @ first.T_camera_board)
         try:
-            solution = solve(samples.problem(), SolveConfig(most_translation=0.02, most_rotation=0.05))
+            solution = solve_robustly(samples.problem(), SolveConfig(most_translation=0.02, most_rotation=0.05))
         except OpenArmError as error:
             if error.code != Code.DEGENERATE:
                 raise
