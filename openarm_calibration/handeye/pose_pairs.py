@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from openarm_calibration.handeye.closed_form import METHODS, REFINED, closed_form
 from openarm_calibration.handeye.observability import FEWEST, motion, motion_fault
 from openarm_calibration.handeye.problem import Setup, inverses, moved, skews
-from openarm_calibration.handeye.refine import invert_scaled, mount_error
+from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.handeye.unknowns import invert_scaled
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array, Mask

@@ -15,6 +15,7 @@ import numpy as np
 from openarm_common.errors import OpenArmError
 from openarm_common.motors.bus import emulated_buses
 from openarm_common.motors.wiring import Wiring, axes_of, load_wiring
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ArmLoad, ServoModel
 from openarm_common.ros.node import run
 from openarm_control.controller import RobotController
@@ -53,7 +54,7 @@ class OpenArmHardware(ControlNode[HardwareNodeConfig]):
         self._settings = config.motors.settings(flexible=wiring.flexible)
         self._posture = LastPosture(config.calibrations, "_emulated" if config.emulated else "")
         seed = None if config.dynamics_seed < 0 else config.dynamics_seed
-        known = {side: _servo_model(config, wiring, load) for side, load in loads.items()}
+        known = {side: _servo_model(config, wiring, description, load) for side, load in loads.items()}
         servos = KnownServos(known, config.calibrations, seed, self.get_logger().warning)
         names = joint_names(description)
         effort = {axis.arm: abs(axis.torque * axis.ratio) for axis in self._axes if axis.grips}
@@ -177,10 +178,10 @@ def percentiles(bins: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[float, float
     return (p50 + 1) * BIN_S, (p99 + 1) * BIN_S
 
 
-def _servo_model(config: HardwareNodeConfig, wiring: Wiring, load: ArmLoad) -> ServoModel:
+def _servo_model(config: HardwareNodeConfig, wiring: Wiring, robot: RobotDescription, load: ArmLoad) -> ServoModel:
     """Return the servos of an arm with the gains that the motors are given."""
     gains = {"stiffness": wiring.joints.stiffness, "damping": wiring.joints.damping}
-    return config.servos.model_copy(update=gains).model(load)
+    return config.servos.model_copy(update=gains).model(robot, load)
 
 
 def make() -> OpenArmHardware:
