@@ -91,8 +91,9 @@ def test_what_takes_two_arms_is_not_offered(robot: RobotDescription) -> None:
     )
     assert asyncio.run(simultaneous(cast("Any", pair))) is None
     assert "one arm" in notes[-1]
-    with pytest.raises(OpenArmError, match="needs two arms"):
-        make_task("handover", 0)
+    for suite in ("handover", "push", "pairs"):
+        with pytest.raises(OpenArmError, match="needs two arms"):
+            make_task(suite, 0)
 
 
 @pytest.mark.requirement("B-13")

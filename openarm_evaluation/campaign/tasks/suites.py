@@ -23,8 +23,8 @@ SUITES = {
     "objects": objects_task,
     "heap": heap_task,
 }
-#: Those that two arms share.
-OF_TWO_ARMS = ("handover", "pairs", "pairs_in_turn")
+#: Those that two arms share, or whose objects stand between two arms.
+OF_TWO_ARMS = ("handover", "push", "pairs", "pairs_in_turn")
 
 
 def make_task(set_name: str, seed: int, objects: str = "") -> Task:
