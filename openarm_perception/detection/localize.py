@@ -35,6 +35,8 @@ from openarm_perception.geometry.patch import Patch, cut
 _SIDE_POINTS = 150
 #: What is robot to a larger share is no object on the table.
 _MOSTLY = 0.5
+#: So much of the outline in view is all of it; and so much parts the object from others, where depth has holes too.
+_ALL, _PARTED = 0.95, 0.7
 #: Fewer pixels, without their border, are the fringe of the robot or of what it holds.
 _STICKS_OUT = 6
 
@@ -130,13 +132,16 @@ class Localizer:
         flank = solid & (patch.points[..., 2] < top - patch.band)
         sides = patch.points[cv2.erode(flank.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, :2]
         sides = sides[:: max(1, len(sides) // _SIDE_POINTS)]
-        edges, visible = self._edges(patch, face, flank, top)
+        edges, visible, parted = self._edges(patch, face, flank, top)
         try:
             shape = footprint.fit(np.concatenate([edges, sides]), pixel)
-            if shape.rms > self.config.prism_rms:
-                shape = footprint.bound(patch.points[solid][:, :2], pixel)
         except OpenArmError as error:
-            raise _refusal(found, error.code, f": {error.message}") from error
+            # an outline that is in view is no prism's; one that something hides or touches may be
+            if visible < _ALL or parted < _PARTED:
+                raise _refusal(found, error.code, f": {error.message}") from error
+            shape = None
+        if shape is None or shape.rms > self.config.prism_rms:
+            shape = _bound(patch, solid, pixel)
         return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
 
     def enclose(self, patch: Patch, withheld: OpenArmError | None = None) -> LocatedObject:
@@ -232,8 +237,10 @@ class Localizer:
         count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
         return labels == 1 + int(np.argmax(stats[1:count, cv2.CC_STAT_AREA]))
 
-    def _edges(self, patch: Patch, face: Mask, flank: Mask, top: float) -> tuple[Array, float]:
-        """Return points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view.
+    def _edges(self, patch: Patch, face: Mask, flank: Mask, top: float) -> tuple[Array, float, float]:
+        """Return points (n, 2) on the edges of the top, base frame, m, and which shares of its outline are in view.
+
+        The second of these is of what is an edge: where it touches another object of its height there is none.
 
         An edge lies between the face and what is far from it, or what belongs to the `flank`.
         """
@@ -263,7 +270,8 @@ class Localizer:
             # the face goes on down the flank as far as heights count as top
             height = np.where(ridge[edge], top - patch.band, top)
             found.append(camera[:2] + ray[:, :2] * ((height - camera[2]) / ray[:, 2])[:, None])
-        return np.concatenate(found), seen / max(seen + hidden, 1)
+        points = np.concatenate(found)
+        return points, seen / max(seen + hidden, 1), len(points) / max(seen + hidden, 1)
 
     def _detection(
         self, found: Detection2D, shape: footprint.Footprint, top: float, count: int, visible: float
@@ -282,6 +290,14 @@ class Localizer:
             found.name, found.score * visible, T, size, shape.kind == "circle", kind, color=found.color,
             source=found, covariance=covariance, points=count, visible=visible, method=shape.kind,
         )  # fmt: skip
+
+
+def _bound(patch: Patch, solid: Mask, pixel: float) -> footprint.Footprint:
+    """Return the rectangle around points, without those of the border, where a sensor reports any depth."""
+    inner = cv2.erode(solid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    if np.count_nonzero(inner) < 0.5 * np.count_nonzero(solid):
+        return footprint.bound(patch.points[solid][:, :2], pixel)
+    return footprint.bound(patch.points[inner][:, :2], 3.0 * pixel)
 
 
 def _shape(found: Detection2D, method: footprint.Kind) -> str:

@@ -20,6 +20,7 @@ from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import DepthImage, check_size, unit_scale
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.wanted import describe, fits
+from openarm_perception.detection.anything import clusters
 from openarm_perception.detection.detector import ColorDetector, Detection2D, Detector, Image, Mask, Policy, rank
 from openarm_perception.detection.faults import DetectionFaults
 from openarm_perception.detection.kinds import DetectorKind
@@ -176,8 +177,6 @@ class Pipeline:
         return ImageDetections(self.detector.detect(view.rgb))
 
 
-#: Name of what is found without knowing what it is.
-ANYTHING = "anything"
 #: Pixels around a box of a network that are examined: its sides are that exact.
 _MARGIN = 4
 #: An object has a colour when this share of its pixels has it.
@@ -186,8 +185,6 @@ _COLOURED = 0.5
 _SAME = 0.5
 #: Fewer pixels are nothing.
 _PIXELS = 60
-#: Nothing on the table is taller than this, m; where depth jumps by more, objects end, m.
-_TALLEST, _JUMP = 0.30, 0.020
 
 
 @dataclass(eq=False)
@@ -361,33 +358,6 @@ def with_colour(detection: Detection2D, rgb: Image, colors: ColorDetector) -> De
     (u, v), (w, h) = detection.origin, detection.size
     color, share = colors.name(np.ascontiguousarray(rgb[v : v + h, u : u + w]), detection.mask)
     return replace(detection, color=color) if share >= _COLOURED else detection
-
-
-def clusters(view: View, localizer: Localizer) -> tuple[Detection2D, ...]:
-    """Return everything above the table, separated where depth jumps; the score is the share of its convex hull."""
-    above = view.heights(localizer.limits) - np.float32(localizer.table_height)
-    standing = (above > localizer.config.table_margin) & (above < _TALLEST)
-    if view.robot is not None:
-        standing &= ~view.robot
-    z = view.depth.astype(np.float32) * np.float32(unit_scale(view.depth))
-    for near, far in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        # the farther side of a jump is background of the nearer, whatever it belongs to
-        standing[far] &= z[far] - z[near] < _JUMP
-        standing[near] &= z[near] - z[far] < _JUMP
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(standing.astype(np.uint8), connectivity=4)
-    size = (view.rgb.shape[1], view.rgb.shape[0])
-    found: list[Detection2D] = []
-    for i in range(1, count):
-        left, top, w, h, area = (int(value) for value in stats[i])
-        if area < 2 * _PIXELS:
-            continue
-        mask = labels[top : top + h, left : left + w] == i
-        hull = cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32))
-        full = min(1.0, area / max(float(cv2.contourArea(hull)), 1.0))
-        detection = _detection(mask, (left, top), size, ANYTHING, full)
-        if detection is not None:
-            found.append(detection)
-    return tuple(sorted(found, key=lambda d: -d.area))
 
 
 def same(a: Detection2D, b: Detection2D) -> bool:

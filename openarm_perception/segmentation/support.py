@@ -111,11 +111,41 @@ def find_support(points: Points, up: Array | None = None) -> Support:
         off = np.abs((used - middle) @ normal) / (used[:, 2] ** 2 * facing[on])
         # a standard deviation of what is left within the band; 1.55 makes up for its tails
         noise = float(np.clip(1.55 * np.median(off), LEAST_NOISE, _MOST_NOISE))
-    axes = np.linalg.svd(normal[None])[2][1:].T
-    if np.linalg.det(np.column_stack([axes, normal])) < 0.0:
-        axes = axes[:, ::-1].copy()
+    axes = _axes(normal)
     hull = cv2.convexHull((used @ axes).astype(np.float32))[:, 0].astype(np.float64)
     return Support(normal, -float(normal @ middle), noise, hull, axes, len(used) / max(measured, 1))
+
+
+def support_at(points: Points, T_base_camera: Array, height: float) -> Support:
+    """Return the level plane at a known height, with the noise that is measured at it.
+
+    Args:
+        points: (h, w, 3) organised, optical frame, m; NaN where nothing was measured.
+        T_base_camera: (4, 4) optical frame in the base frame, whose z points up.
+        height: Of the plane in the base frame, m.
+    """
+    normal = T_base_camera[2, :3].astype(np.float64)
+    offset = float(T_base_camera[2, 3]) - height
+    step = max(1, math.ceil(math.sqrt(points.shape[0] * points.shape[1] / _SAMPLES)))
+    seen = points[::step, ::step].reshape(-1, 3).astype(np.float64)
+    seen = seen[np.isfinite(seen[:, 2])]
+    off = seen @ normal + offset
+    facing = np.abs(seen @ normal) / np.maximum(np.linalg.norm(seen, axis=1), 1e-6)
+    sigma = off / np.maximum(seen[:, 2] ** 2 * facing, 1e-6)
+    near = sigma[np.abs(off) <= 3.0 * FIRST_NOISE * np.maximum(seen[:, 2] ** 2, 0.5)]
+    # about the median: the height may be a little off
+    noise = 1.4826 * float(np.median(np.abs(near - np.median(near)))) if len(near) >= 12 else FIRST_NOISE
+    axes = _axes(normal)
+    flat = seen @ axes
+    hull = cv2.convexHull(flat.astype(np.float32))[:, 0].astype(np.float64) if len(flat) >= 3 else np.zeros((3, 2))
+    share = len(near) / max(len(seen), 1)
+    return Support(normal, offset, float(np.clip(noise, LEAST_NOISE, _MOST_NOISE)), hull, axes, share)
+
+
+def _axes(normal: Array) -> Array:
+    """Return two directions (3, 2) that are a right-handed frame with a normal."""
+    axes = np.linalg.svd(normal[None])[2][1:].T
+    return axes if np.linalg.det(np.column_stack([axes, normal])) > 0.0 else axes[:, ::-1].copy()
 
 
 def _vote(points: Array, normals: Array) -> tuple[Array, Array]:

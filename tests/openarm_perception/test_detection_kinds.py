@@ -199,3 +199,17 @@ def test_anything_parts_what_stands_behind_another_and_leaves_the_robot_out(tabl
     left = perceive("anything", three(tabletop), {}, robot=robot)
     assert len(left.found) == 2
     assert all(d.origin[0] >= 320 for d in left.found)
+
+
+def test_what_is_no_prism_is_located_not_called_hidden(tabletop, perceive) -> None:
+    """A hammer of two boxes: no rectangle fits, nothing hides it, and it lies still."""
+    hammer = [
+        tabletop.Thing("red", "box", (0.15, 0.03, 0.03), 0.30, 0.0),
+        tabletop.Thing("red", "box", (0.03, 0.10, 0.03), 0.39, 0.0),
+    ]
+    seen = perceive("anything", hammer, {})
+    assert seen.refused == ()
+    (place,) = seen.located
+    assert place.method == "bound"
+    assert place.size == pytest.approx((0.10, 0.18, 0.03), abs=0.006)
+    assert place.p_base[:2] == pytest.approx((0.315, 0.0), abs=0.004)
