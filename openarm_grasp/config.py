@@ -120,6 +120,12 @@ class DetectConfig(Config):
     agree_within: float = Field(
         default=0.003, gt=0.0, le=0.02, description="largest spread of the object's position, m"
     )
+    shape_agrees_within: float = Field(
+        default=0.010,
+        gt=0.0,
+        le=0.05,
+        description="the same of what is no prism, by the middle of its points, m",
+    )
     max_age: float = Field(default=0.5, gt=0.0, le=5.0, description="oldest detection that is acted on, s")
     attempts: int = Field(
         default=3, ge=1, le=20, description="rounds of frames without the object before it is refused"

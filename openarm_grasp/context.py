@@ -6,12 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from openarm_common.camera.cameras import hand_cameras, load_cameras
+from openarm_common.camera.cameras import CameraConfig, hand_cameras, load_cameras
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import per_robot
 from openarm_common.robot.hand import HandParts
 from openarm_common.robot.work import Table
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.arms import Shoulders, arm_order
+from openarm_grasp.sampling.hand_shape import HandShape
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class GraspContext:
         hand: Measures of the grippers.
         shoulders: (x, y) of each arm's shoulder, base frame, m.
         looks: Camera of the second look, by the arm whose hand carries it.
+        cameras: At their mounts: the hand carries their housings.
     """
 
     config: GraspConfig
@@ -31,11 +34,18 @@ class GraspContext:
     hand: HandParts
     shoulders: Shoulders
     looks: Mapping[str, str] = field(default_factory=dict[str, str])
+    cameras: tuple[CameraConfig, ...] = ()
 
     @classmethod
-    def of(cls, config: GraspConfig, table: Table, robot: RobotDescription) -> GraspContext:
-        """That of a robot at a table."""
-        cameras = load_cameras()
+    def of(
+        cls,
+        config: GraspConfig,
+        table: Table,
+        robot: RobotDescription,
+        cameras: Mapping[str, CameraConfig] | None = None,
+    ) -> GraspContext:
+        """That of a robot at a table; `cameras`, by name, are where they are mounted, nominal without."""
+        cameras = load_cameras() if cameras is None else cameras
         looks = {robot.arm_of(cameras[name].parent): name for name in hand_cameras()} if config.near.enabled else {}
         return cls(
             config,
@@ -43,7 +53,12 @@ class GraspContext:
             robot.hand(robot.arm_names[0]).parts,
             {arm: _shoulder(robot, arm) for arm in robot.arm_names},
             looks,
+            tuple(cameras.values()),
         )
+
+    def shape(self, arm: str) -> HandShape:
+        """Return the shape of an arm's open hand, with the cameras that it carries; made the first time."""
+        return _shape(arm, self.cameras)
 
     def arm_order(self, arm: str, y: float) -> tuple[str, ...]:
         """Arms to try for an object; see `openarm_grasp.planning.arms.arm_order`."""
@@ -53,6 +68,11 @@ class GraspContext:
     def clear_of_objects(self) -> float:
         """Height of a hand, base frame, m; one that is lower may be among the objects."""
         return self.table.top_z + 2.0 * self.config.approach.lift_height
+
+
+@per_robot
+def _shape(arm: str, cameras: tuple[CameraConfig, ...]) -> HandShape:
+    return HandShape.of(RobotDescription.load(), arm, cameras)
 
 
 def _shoulder(robot: RobotDescription, arm: str) -> tuple[float, float]:

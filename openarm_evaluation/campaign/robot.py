@@ -143,7 +143,7 @@ class SimRobot:
         self.trace: deque[tuple[int, Array, Array]] = deque(maxlen=int(_TRACE_S * 1e9) // self.world.period_ns)
         self.images: dict[str, tuple[int, NDArray[np.uint8], DepthImage]] = {}
         #: The cameras where the suite believes that they are mounted.
-        self._mounted = mounted(self.cameras, mounts or {})
+        self.mounted = mounted(self.cameras, mounts or {})
         self._arriving: deque[tuple[int, Frame]] = deque()
         self.frames: deque[Frame] = deque(maxlen=64)
         #: What the hands hold, as the planner believes; the detector takes it for a part of the robot.
@@ -155,9 +155,9 @@ class SimRobot:
         self._published_ns = 0
         #: How long plans took, s of wall clock.
         self.planning_s: list[float] = []
-        self.map = SimulatedMap(self.description, suite.octomap, self._mounted)
+        self.map = SimulatedMap(self.description, suite.octomap, self.mounted)
         self._controllers = {arm: _ArmController(self, arm) for arm in self.simulated.controller.arms}
-        arms = arms_behind(self._sets, self.table, tuple(self._mounted.values()))
+        arms = arms_behind(self._sets, self.table, tuple(self.mounted.values()))
         self.motion = MotionService(self, suite.motion, arms, self.map, (self.description.root,))
         self.motion.on_held = self._take_held
         self._note()
@@ -346,7 +346,7 @@ class SimRobot:
             joints = self.states.joints_at(min(stamp_ns, newest_ns))
         except OpenArmError:
             return None
-        return _finder(self._sets, name, tuple(self._mounted.values())).find(view, joints, self.held)[0]
+        return _finder(self._sets, name, tuple(self.mounted.values())).find(view, joints, self.held)[0]
 
     def draw(self, name: str) -> tuple[NDArray[np.uint8], DepthImage]:
         """Colour and depth (mm) that a camera sees now; the same image for whoever asks in this tick."""
@@ -368,7 +368,7 @@ class SimRobot:
         Raises:
             OpenArmError: STALE_DATA, when the camera rides on a joint of which the stamp knows nothing.
         """
-        T_parent_link = self._mounted[camera.name].T_parent_link
+        T_parent_link = self.mounted[camera.name].T_parent_link
         T_link_optical = se3.inverse(camera.T_parent_link) @ camera.T_parent_optical
         T_base_parent = self.states.lookup(self.description.root, camera.parent, stamp_ns)
         return T_base_parent @ T_parent_link @ T_link_optical

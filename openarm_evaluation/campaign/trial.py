@@ -87,7 +87,9 @@ class Trials:
         )
         self.link = InProcessRobot(self.robot, config)
         self.skills = Skills(self.link, config)
-        self.session = GraspSession(GraspContext.of(config, self.robot.table, self.robot.description))
+        self.session = GraspSession(
+            GraspContext.of(config, self.robot.table, self.robot.description, self.robot.mounted)
+        )
         self.steps: list[Step] = []
         self._keep = record.Keeper(self.robot, folder) if folder is not None else None
         self._faulty = False

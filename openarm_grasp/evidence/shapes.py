@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -24,6 +25,8 @@ _HEIGHT, _HEIGHT_SHARE = 0.008, 0.08
 _EXTENT, _EXTENT_SHARE = 0.015, 0.25
 #: A cluster with a smaller share of the points of the thing is a remainder of something else.
 _SAME_THING = 0.3
+#: Of the points of a thing that has not moved so many lie where it was, %: the rest may be the edge of the hand.
+_MOST = 85.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +110,23 @@ def judge_gone(
                 return CameraVerdict(Code.GRASP_MISSED, text)
     text = f", and is seen {highest * 1e3:.0f} mm higher" if highest else ""
     return CameraVerdict(Code.OK, f"the cluster has gone from its place{text}")
+
+
+def judge_unmoved(before: Array, now: Array, config: HeldConfig) -> tuple[bool, str]:
+    """Whether a thing still stands where it was seen, as far as the hand above it lets the camera see.
+
+    Args:
+        before: (n, 3) points of it as it was seen before.
+        now: (n, 3) points of what is seen there now.
+        config: Thresholds.
+    """
+    if len(now) < _SAME_THING * len(before) or not len(before):
+        return True, "the hand hides the object"
+    away, _ = KDTree(before).query(now)
+    off, limit = 1e3 * float(np.percentile(away, _MOST)), 1e3 * config.moved
+    if off > limit:
+        return False, f"the object has moved: it reaches {off:.0f} mm out of where it stood, expected {limit:.0f}"
+    return True, "the object still stands there"
 
 
 def judge_rests(before: Cluster, p_expected: Array, frames: Sequence[ClusterFrame], tolerance: float) -> CameraVerdict:

@@ -26,6 +26,8 @@ from openarm_grasp.config import DetectConfig
 SAME_PLACE = 0.05
 #: Clouds of so many frames are enough.
 _CLOUDS = 3
+#: An object of fewer points has no cloud.
+_LEAST_POINTS = 60
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ class Sighting:
         target: The averaged detection.
         others: Every other object, newest sight of each.
         t_ns: Stamp of the newest frame.
-        clouds: Of the newest frames that show the target, with its points labelled 1 and all others 0.
+        clouds: Of the newest frames that show the target, with its points labelled 1, those of other
+            detections 2, and all others 0.
     """
 
     target: Detection
@@ -70,6 +73,16 @@ def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Fr
         found = (replace(d, T_base_object=T @ d.T_base_object) for d in frame.detections)
         moved.append(replace(frame, detections=tuple(found)))
     return tuple(moved)
+
+
+def picked(frame: Frame, detections: Sequence[Detection]) -> Frame:
+    """Return a frame with some of its detections alone; the points of others belong to none."""
+    if frame.cloud is None:
+        return replace(frame, detections=tuple(detections))
+    labels = np.zeros_like(frame.cloud.labels)
+    for number, one in enumerate(detections, start=1):
+        labels[frame.cloud.labels == frame.detections.index(one) + 1] = number
+    return replace(frame, detections=tuple(detections), cloud=replace(frame.cloud, labels=labels))
 
 
 def apart(a: Detection, b: Detection) -> float:
@@ -105,7 +118,9 @@ def average(track: Sequence[Detection]) -> Detection:
     score = float(np.mean([d.score for d in track]))
     around = 2 * sum(d.round for d in track) > len(track)
     T, size = se3.make(se3.rot_z(yaw), p), np.mean(sizes, axis=0)
-    return replace(reference, score=score, T_base_object=T, size=size, round=around)
+    # what seems a prism in some frames alone is none
+    kind = reference.kind if all(d.kind for d in track) else ""
+    return replace(reference, score=score, T_base_object=T, size=size, round=around, kind=kind)
 
 
 def in_view(frames: Sequence[Frame], label: str) -> tuple[Detection, ...]:
@@ -163,9 +178,8 @@ def find(
         if not near:
             continue
         track.append(min(near, key=lambda d: _distance(d, anchor)))
-        if frame.cloud is not None:
-            number = frame.detections.index(track[-1]) + 1
-            clouds.append(replace(frame.cloud, labels=(frame.cloud.labels == number).astype(np.uint32)))
+        mine = _labelled(frame, track[-1])
+        clouds += [mine] if mine is not None else []
     # A detector may miss a thing in one frame; in most of them it must be in its place.
     if 3 * len(track) < 2 * len(frames):
         blurred = [f for f in frames if any(not d.measured and _same_thing(d, anchor) for d in f.detections)]
@@ -176,16 +190,32 @@ def find(
             f"{anchor.label!r} is in the same place in {len(track)} of {len(frames)} frames only: expected one within"
             f" {limits.match_radius * 1e3:.0f} mm of {_text(anchor.p_base)} in two thirds of them",
         )
-    steps = [_distance(a, b) for a, b in pairwise(track)]
-    if steps and max(steps) > limits.agree_within:
+    spots = [d.p_base for d in track]
+    if len(clouds) == len(track) and not all(d.kind for d in track):
+        # the box around what is no prism changes with the noise, the middle of its points hardly does
+        spots = [cloud.points[cloud.labels == 1].mean(axis=0, dtype=np.float64) for cloud in clouds]
+    limit = limits.agree_within if all(d.kind for d in track) or not clouds else limits.shape_agrees_within
+    steps = [float(np.linalg.norm(a - b)) for a, b in pairwise(spots)]
+    if steps and max(steps) > limit:
         raise OpenArmError(
             Code.STALE_DATA,
             f"{anchor.label!r} moved {max(steps) * 1e3:.1f} mm between two frames, expected at most"
-            f" {limits.agree_within * 1e3:.1f} mm; is it at rest?",
+            f" {limit * 1e3:.1f} mm; is it at rest?",
         )
     target = average(track)
     others = _others(frames, target, limits.match_radius)
     return Sighting(target, others, frames[-1].t_ns, tuple(clouds[-_CLOUDS:]))
+
+
+def _labelled(frame: Frame, detection: Detection) -> LabelledCloud | None:
+    """The points of a frame, 1: of a detection, 2: of another, 0: of none; None where it has too few."""
+    if frame.cloud is None:
+        return None
+    mine = frame.cloud.labels == frame.detections.index(detection) + 1
+    if np.count_nonzero(mine) < _LEAST_POINTS:
+        return None
+    labels = np.where(mine, 1, np.where(frame.cloud.labels > 0, 2, 0))
+    return replace(frame.cloud, labels=labels.astype(np.uint32))
 
 
 def _same(frames: Sequence[Frame], before: Sighting) -> Detection:

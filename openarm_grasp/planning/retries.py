@@ -72,7 +72,7 @@ class Ways:
     repeats: tuple[GraspCandidate, ...]
 
 
-def ways(
+def proposed(
     target: Detection,
     config: GraspConfig,
     hand: HandParts,
@@ -80,11 +80,11 @@ def ways(
     *,
     shoulder_xy: Sequence[float] = (0.0, 0.0),
     others: Sequence[Detection] = (),
-) -> Ways:
-    """Propose grasps for the next attempt.
+) -> tuple[GraspCandidate, ...]:
+    """Propose grasps of a box or a cylinder for the next attempt.
 
     After a collision the hand first stays higher; else a higher grasp is what is left when all others are refused.
-    Fingers go to other sides first. Lower than it is, no grasp can be: tips, pads or palm decide.
+    Lower than it is, no grasp can be: tips, pads or palm decide.
 
     Args:
         target: The object as it is seen now.
@@ -97,14 +97,14 @@ def ways(
     Raises:
         OpenArmError: TOO_WIDE, when no side fits into the hand.
     """
+    offered = propose(target, config, hand, shoulder_xy=shoulder_xy, others=others)
     if not failed:
-        return Ways(propose(target, config, hand, shoulder_xy=shoulder_xy, others=others), ())
+        return offered
     after_collision = any(one.code is Code.HAND_COLLISION for one in failed)
     height = _RAISED_AFTER_COLLISION if after_collision else _RAISED
-    offered = propose(target, config, hand, shoulder_xy=shoulder_xy, others=others)
     higher = propose(target, config, hand, shoulder_xy=shoulder_xy, others=others, raised=RAISE)
     raised = (replace(one, score=one.score + height, parts={**one.parts, "raised": height}) for one in higher)
-    return among((*offered, *raised), target, failed)
+    return (*offered, *raised)
 
 
 def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence[FailedGrasp]) -> Ways:

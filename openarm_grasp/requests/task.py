@@ -44,6 +44,11 @@ class Grasp:
     places: tuple[PlaceTarget, ...]
     closed: float | None = None
 
+    @property
+    def of_cloud(self) -> bool:
+        """Whether it was found on the cloud of the object, of which no box is known."""
+        return self.candidate.apertures is not None and bool(self.sighting.clouds)
+
     def judge(self, evidence: Evidence, config: HeldConfig, *, was_held: bool = False) -> GripperVerdict:
         """What the gripper says: of a box by its width, of any other shape by the interval and by `closed`."""
         apertures = self.candidate.apertures

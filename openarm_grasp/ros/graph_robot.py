@@ -13,6 +13,7 @@ from openarm_interfaces.srv import ComputeIK, GetScene
 from rclpy.client import Client
 from rclpy.task import Future
 
+from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
@@ -81,6 +82,10 @@ class GraphRobot:
     def follow_table(self, on_height: Callable[[float], None]) -> None:
         """Call a function with the height of the table, base frame, m, whenever it is published."""
         self._nodes.robot.follow_table(on_height)
+
+    def follow_mounts(self, on_mounts: Callable[[dict[str, CameraConfig]], None]) -> None:
+        """Call a function with the cameras, by name, whenever one with a housing is mounted elsewhere."""
+        self._nodes.robot.follow_mounts(on_mounts)
 
     def close(self) -> None:
         """Leave the arms to others, and take the clients down."""

@@ -7,7 +7,7 @@ Services /grasp, /grasp/confirm and /grasp/release, actions /grasp/pick and /gra
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
@@ -20,6 +20,7 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
+from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
@@ -34,6 +35,7 @@ from openarm_grasp.robot.skills import Skills
 from openarm_grasp.ros import messages
 from openarm_grasp.ros.flight_recorder_client import FlightRecorderClient
 from openarm_grasp.ros.graph_robot import GraphRobot
+from openarm_grasp.sampling.samplers import make_sampler
 from openarm_grasp.strategies.pair import Pair
 from openarm_grasp.strategies.registry import carry_out, carry_out_pair
 
@@ -50,12 +52,14 @@ class GraspNode(BaseNode[GraspConfig]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("grasp", GraspConfig, **kwargs)
+        make_sampler(self.config.sampler)  # one that does not exist is refused now
         context = GraspContext.of(self.config, load_scene(self.config.scene).table, self.description)
         self._robot = GraphRobot(self, self.config)
         self._skills = Skills(self._robot, self.config)
         self._session = GraspSession(context)
         self._flight_recorder = FlightRecorderClient(self)
         self._robot.follow_table(self._take_table)
+        self._robot.follow_mounts(self._take_mounts)
         #: What is being carried out, for the answer to what comes meanwhile.
         self._running = ""
         self._newest: dict[int, Status] = {}
@@ -83,6 +87,9 @@ class GraspNode(BaseNode[GraspConfig]):
     def _take_table(self, height: float) -> None:
         context = self._session.context
         self._session.context = replace(context, table=context.table.at(height))
+
+    def _take_mounts(self, cameras: Mapping[str, CameraConfig]) -> None:
+        self._session.context = replace(self._session.context, cameras=tuple(cameras.values()))
 
     # --- callbacks
     async def _on_grasp(self, request: Grasp.Request, response: Grasp.Response) -> Grasp.Response:

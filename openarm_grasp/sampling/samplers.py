@@ -20,7 +20,8 @@ from openarm_common.octree.distance_field import DistanceField
 from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.candidates import UP, GraspCandidate, propose
+from openarm_grasp.planning.candidates import UP, GraspCandidate
+from openarm_grasp.planning.retries import FailedGrasp, proposed
 from openarm_grasp.sampling.antipodal import Antipodal, Search
 from openarm_grasp.sampling.hand_shape import HandShape
 from openarm_grasp.sampling.slabs import slabs
@@ -43,6 +44,7 @@ class Sampling:
         surface: The object and what is around it, as cameras saw it; None: only the boxes are known.
         shape: Of the open hand with the cameras that it carries; needed with a surface.
         field: Distances to obstacles, base frame; read where the surface knows nothing.
+        failed: Grasps of it that have failed.
     """
 
     target: Detection
@@ -53,6 +55,7 @@ class Sampling:
     surface: Surface | None = None
     shape: HandShape | None = None
     field: DistanceField | None = None
+    failed: Sequence[FailedGrasp] = ()
 
 
 class GraspSampler(Protocol):
@@ -82,7 +85,14 @@ class Boxes:
 
     def candidates(self, asked: Sampling) -> tuple[GraspCandidate, ...]:
         """As of `GraspSampler`."""
-        return propose(asked.target, asked.config, asked.hand, shoulder_xy=asked.shoulder_xy, others=asked.others)
+        return proposed(
+            asked.target,
+            asked.config,
+            asked.hand,
+            asked.failed,
+            shoulder_xy=asked.shoulder_xy,
+            others=asked.others,
+        )
 
 
 class Cloud:
@@ -104,7 +114,7 @@ class Auto:
         """As of `GraspSampler`."""
         if asked.surface is None:
             return Boxes().candidates(asked)
-        if asked.target.measured:
+        if asked.target.kind:  # the shape of a prism that fits its outline
             try:
                 return Boxes().candidates(asked)
             except OpenArmError as error:

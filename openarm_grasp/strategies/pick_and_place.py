@@ -10,11 +10,16 @@ Base frame, m.
 from __future__ import annotations
 
 import traceback
+from collections.abc import Sequence
 from dataclasses import replace
 
+from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
+from openarm_grasp.evidence.shapes import judge_gone, judge_rests, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
+from openarm_grasp.perception.clouds import cluster_frames, cluster_of, object_points, points_near
 from openarm_grasp.perception.detections import Frame, apart
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.place import place_targets, placing_error
@@ -104,7 +109,7 @@ async def _attempts(run: Run) -> GraspOutcome:
             run.enter(State.RESET, error.message)
         await retreat(run, grasp, placed)
         if placed is not None and placed.failure is None:
-            seen = await verify(run, placed)
+            seen = await verify(run, grasp, placed)
             if seen.ok:
                 text = f"{seen.reason}, placed by the {run.arm} arm"
                 return succeeded(run, text, gripper=placed.gripper, camera=seen)
@@ -155,7 +160,7 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
         grasp, plan, why = await _correct(run, grasp, plan, camera)
     run.enter(State.MOVE_TO_GRASP, why)
     target = grasp.sighting.target
-    still, why = verdicts.judge_still(target, (await robot.observe(1)).frames, config.held)
+    still, why = _still(grasp, (await robot.observe(1)).frames, config)
     if not still and run.suspected is not None and apart(target, run.suspected) < config.detect.agree_within:
         still, why = True, f"{why}; so it seemed before, and it had not: the hand hides a part of it"
     run.suspected = target
@@ -202,6 +207,13 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[
     run.enter(State.MOVE_TO_PREGRASP, why)
     await robot.follow(grasp.arm, plan.transfer, "correct the pre-grasp")
     return corrected, plan, "the open hand is before the object"
+
+
+def _still(grasp: Grasp, frames: Sequence[Frame], config: GraspConfig) -> tuple[bool, str]:
+    """Whether the object still stands where it was seen; of what is no box, the points are compared."""
+    if grasp.of_cloud:
+        return judge_unmoved(object_points(grasp.sighting.clouds), points_near(frames, grasp.sighting), config.held)
+    return verdicts.judge_still(grasp.sighting.target, frames, config.held)
 
 
 # --- grasp
@@ -255,14 +267,20 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
     evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
     frames = (await robot.observe(_LIFT_FRAMES)).frames
     gripper = grasp.judge(evidence, config.held, was_held=True)
-    camera = verdicts.judge_sight(
-        sighting.target,
-        frames,
-        config.held,
-        match_radius=config.detect.match_radius,
-        others=sighting.others,
-        lift=float(grasp.candidate.retreat_offset[2]),
-    )
+    if grasp.of_cloud:
+        place = sighting.target.p_base
+        camera = judge_gone(
+            cluster_of(sighting), cluster_frames(frames, place), config.held, match_radius=config.detect.match_radius
+        )
+    else:
+        camera = verdicts.judge_sight(
+            sighting.target,
+            frames,
+            config.held,
+            match_radius=config.detect.match_radius,
+            others=sighting.others,
+            lift=float(grasp.candidate.retreat_offset[2]),
+        )
     verdict = verdicts.judge_lift(gripper, camera)
     if not verdict.ok:
         run.hand = Hand.HOLDING if gripper.ok else Hand.AT_OBJECT
@@ -336,7 +354,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
 
 
 # --- verify
-async def verify(run: Run, placed: Placed) -> CameraVerdict:
+async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
     """Judge by the camera, from home, whether the object is at its place.
 
     Raises:
@@ -354,6 +372,11 @@ async def verify(run: Run, placed: Placed) -> CameraVerdict:
         if any(d.label == run.label for frame in frames for d in frame.detections):
             break
         text = f"{run.label!r} is not in view after the place; observing again"
+    if grasp.of_cloud:
+        before = cluster_of(grasp.sighting)
+        T_base_now = placed.target.T_base_tcp @ se3.inverse(grasp.candidate.T_base_tcp)
+        rests = se3.apply(T_base_now, before.centroid)
+        return judge_rests(before, rests, cluster_frames(frames, rests), config.place.tolerance)
     error = placing_error(run.label, placed.target, frames[-1]) if frames else None
     if error is not None:
         run.task.session.drift.add(run.arm, *error)

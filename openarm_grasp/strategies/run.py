@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.perception.clouds import views_of
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
@@ -19,6 +21,10 @@ from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest,
 from openarm_grasp.requests.states import Hand, State, check_transition
 from openarm_grasp.requests.task import Findings, Grasp, Placed, Status, Task
 from openarm_grasp.robot.interface import Planned
+from openarm_grasp.sampling.samplers import Sampling, make_sampler
+from openarm_grasp.sampling.surface import fuse
+
+_sampler = cache(make_sampler)
 
 
 class Run:
@@ -118,10 +124,28 @@ class Run:
             self.arm, self.hand = "", Hand.FREE
 
     def ways(self, arm: str, sighting: Sighting) -> retries.Ways:
-        """Grasps for an arm; those that have failed apart from the others."""
-        shoulder, hand = self.context.shoulders.get(arm, (0.0, 0.0)), self.context.hand
-        return retries.ways(
-            sighting.target, self.config, hand, self.failed, shoulder_xy=shoulder, others=sighting.others
+        """Grasps for an arm; those that have failed apart from the others.
+
+        Boxes and cylinders that fit into the hand are grasped across their faces; everything else on its cloud.
+        """
+        asked = self.asked(arm, sighting)
+        return retries.among(_sampler(self.config.sampler).candidates(asked), sighting.target, self.failed)
+
+    def asked(self, arm: str, sighting: Sighting) -> Sampling:
+        """Return what a sampler is given."""
+        surface = None
+        if sighting.clouds:
+            views = views_of(sighting.clouds, self.context.table.top_z)
+            surface = fuse(views, self.context.table.top_z, step=self.config.cloud.voxel)
+        return Sampling(
+            sighting.target,
+            self.config,
+            self.context.hand,
+            sighting.others,
+            self.context.shoulders.get(arm, (0.0, 0.0)),
+            surface,
+            None if surface is None else self.context.shape(arm),
+            failed=self.failed,
         )
 
     def start_again(self, grasp: Grasp, placed: Placed | None) -> str:

@@ -14,10 +14,10 @@ from openarm_common.labelled_cloud import LabelledCloud
 from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.geometry.depth import Deprojector, DepthLimits, View
 
-#: What lies farther from every detection is left out, m.
+#: What lies farther from every detection is far, m.
 _AROUND = 0.15
-#: Of what is no detection, every so manieth row and column is enough.
-_SPARSE = 2
+#: Of what is no detection, every so manieth row and column is enough: near one, and elsewhere.
+_SPARSE, _FAR = 2, 4
 
 
 def labelled_cloud(
@@ -26,7 +26,7 @@ def labelled_cloud(
     limits: DepthLimits,
     flying: FlyingConfig = FlyingConfig(),  # noqa: B008 - frozen
 ) -> LabelledCloud:
-    """Return the points of detections and of what is within 0.15 m of them, in the optical frame.
+    """Return the points of detections and, fewer, of everything else, in the optical frame.
 
     Pixels of the robot, of what it holds, and those that float between surfaces are left out.
 
@@ -45,6 +45,7 @@ def labelled_cloud(
     sparse = np.zeros_like(near)
     sparse[::_SPARSE, ::_SPARSE] = True
     kept = (label > 0) | (near & sparse)
+    kept[::_FAR, ::_FAR] = True
     if view.robot is not None:
         kept &= ~view.robot
     floats = np.zeros(label.shape, np.uint8)

@@ -37,6 +37,8 @@ _SIDE_POINTS = 150
 _MOSTLY = 0.5
 #: So much of the outline in view is all of it; and so much parts the object from others, where depth has holes too.
 _ALL, _PARTED = 0.95, 0.7
+#: A prism is level in more than this share of its footprint.
+_LEVEL = 0.6
 #: Fewer pixels, without their border, are the fringe of the robot or of what it holds.
 _STICKS_OUT = 6
 
@@ -140,7 +142,8 @@ class Localizer:
             if visible < _ALL or parted < _PARTED:
                 raise _refusal(found, error.code, f": {error.message}") from error
             shape = None
-        if shape is None or shape.rms > self.config.prism_rms:
+        level = visible < _ALL or shape is None or _level_share(patch, face, shape, top) > _LEVEL
+        if shape is None or shape.rms > self.config.prism_rms or not level:
             shape = _bound(patch, solid, pixel)
         return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
 
@@ -290,6 +293,22 @@ class Localizer:
             found.name, found.score * visible, T, size, shape.kind == "circle", kind, color=found.color,
             source=found, covariance=covariance, points=count, visible=visible, method=shape.kind,
         )  # fmt: skip
+
+
+def _level_share(patch: Patch, face: Mask, shape: footprint.Footprint, top: float) -> float:
+    """Return which share of its footprint the top of a thing is level in: 1 of a prism, less of what bulges.
+
+    Args:
+        patch: Around it.
+        face: (h, w) pixels of its top.
+        shape: Its footprint.
+        top: Height of the top, m.
+    """
+    lens, above = patch.intrinsics, float(patch.T_base_camera[2, 3]) - top
+    # a pixel at depth z covers z^3 / (f^2 d) of a plane at the distance d
+    area = float((patch.z[face].astype(np.float64) ** 3).sum()) / (lens.fx * lens.fy * max(above, 1e-3))
+    filled = math.pi / 4.0 if shape.kind == "circle" else 1.0
+    return area / max(filled * float(np.prod(shape.size)), 1e-9)
 
 
 def _bound(patch: Patch, solid: Mask, pixel: float) -> footprint.Footprint:

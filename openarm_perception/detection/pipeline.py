@@ -274,12 +274,16 @@ class TagPipeline(Pipeline):
         return ImageDetections(tuple(found), tuple(doubts))
 
 
+@dataclass(eq=False)
 class ClusterPipeline(Pipeline):
-    """Detects everything on the table, by depth alone; the detector that it is made with is not used."""
+    """Detects everything on the table by depth; the detector that it is made with names colours."""
+
+    detector: ColorDetector  # pyright: ignore[reportIncompatibleVariableOverride] - never replaced
 
     def detect(self, view: View) -> ImageDetections:
         """Return everything above the table that is not the robot."""
-        return ImageDetections(clusters(view, self.localizer))
+        found = clusters(view, self.localizer)
+        return ImageDetections(tuple(with_colour(one, view.rgb, self.detector) for one in found))
 
 
 def make_pipeline(

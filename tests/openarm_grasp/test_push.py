@@ -33,7 +33,7 @@ def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_obj
 
     async def noted(effect: PlanGrasp | PlanPlace) -> Planned:
         if isinstance(effect, PlanGrasp) and not two.pushed:
-            p = effect.target.T_frame_box[:2, 3]
+            p = effect.target[0].T_frame_box[:2, 3]
             ahead.extend([effect] if np.hypot(*(p - (0.46, 0.02))) > 0.05 else [])
         return await plan(effect)
 

@@ -17,7 +17,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import propose
-from openarm_grasp.planning.retries import FailedGrasp, among, ways
+from openarm_grasp.planning.retries import FailedGrasp, among, proposed
 from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from tests.openarm_grasp.scripted import World, standing
@@ -168,7 +168,7 @@ def test_what_changes_first_follows_from_the_cause(code, up):
     target = cube(0.3, 0)
     first = propose(target, CONFIG, HAND)[0]
     failed = FailedGrasp.of(code, "right", first, target)
-    second = ways(target, CONFIG, HAND, (failed,)).fresh[0]
+    second = among(proposed(target, CONFIG, HAND, (failed,)), target, (failed,)).fresh[0]
     assert second.T_base_tcp[2, 3] - first.T_base_tcp[2, 3] == pytest.approx(up)
     assert second.T_base_tcp[:3, 1] @ first.T_base_tcp[:3, 1] == pytest.approx(0.0, abs=0.1)
     assert second.tilt == 0.0

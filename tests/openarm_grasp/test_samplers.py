@@ -51,6 +51,7 @@ class NoSampler:
 
 def test_a_box_that_fits_keeps_its_exact_treatment():
     question = asked([box((0.05, 0.06, 0.05))], (0.05, 0.06, 0.05))
+    question = replace(question, target=replace(question.target, kind="box"))
     found = make_sampler("auto").candidates(question)
     exact = propose(question.target, CONFIG, PARTS)
     assert [c.id for c in found] == [c.id for c in exact]

@@ -69,7 +69,7 @@ def test_a_strategy_that_takes_a_step_that_is_not_allowed_ends_as_a_defect(world
     """Without the closing of the hand, LIFT would follow MOVE_TO_GRASP: nothing is lifted, and the defect is named."""
 
     async def no_closing(run, grasp, why):
-        return why
+        return grasp, why
 
     monkeypatch.setattr(steps, "close", no_closing)
     outcome = world.grasp()

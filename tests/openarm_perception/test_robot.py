@@ -178,5 +178,3 @@ def test_the_points_of_objects_are_on_them_and_what_is_around_is_none_of_theirs(
     assert (rest[:, 2] < scene.table.top_z + 0.004).mean() > 0.95  # the table, and the floor beyond its edge
     table = rest[np.abs(rest[:, 2] - scene.table.top_z) < 0.004]
     assert len(table) > 1000
-    near = [np.linalg.norm(table[:, :2] - place.p_base[:2], axis=1) for place in perceived.boxes]
-    assert np.min(near, axis=0).max() < 0.40

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From labelled clouds to what samplers and verdicts on things of any shape read. Base frame, m."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from openarm_common.labelled_cloud import LabelledCloud
+from openarm_common.types import Array
+from openarm_grasp.evidence.shapes import Cluster, ClusterFrame
+from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart
+from openarm_grasp.sampling.surface import View
+
+#: What is lower above the table is table, m.
+_TABLE = 0.006
+#: Images from cameras nearer to each other are of one camera, m.
+_SAME_CAMERA = 0.002
+#: A place is in view where a point lies this near to it, seen from above, m.
+_IN_VIEW = 0.025
+#: Fewer points are no cluster.
+_LEAST_POINTS = 30
+#: What belongs to no detection and is this near to the object is its border, m.
+_FRINGE = 0.010
+
+
+def views_of(clouds: Sequence[LabelledCloud], table_z: float) -> tuple[View, ...]:
+    """Return what each camera has seen of an object and around it, its images put together.
+
+    Args:
+        clouds: As of a `Sighting`.
+        table_z: Height of the table top.
+    """
+    cameras: list[list[LabelledCloud]] = []
+    for cloud in clouds:
+        same = (group for group in cameras if np.linalg.norm(group[0].camera - cloud.camera) < _SAME_CAMERA)
+        group = next(same, None)
+        if group is None:
+            cameras.append([cloud])
+        else:
+            group.append(cloud)
+    return tuple(_view(group, table_z) for group in cameras)
+
+
+def cluster_of(sighting: Sighting) -> Cluster:
+    """Return what the newest image shows of the object.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED, when it has no points.
+    """
+    points = object_points(sighting.clouds[-1:])
+    return Cluster.of(points, cut=not sighting.target.measured)
+
+
+def object_points(clouds: Sequence[LabelledCloud]) -> Array:
+    """Return the points (n, 3) of the object in clouds whose points labelled 1 are its."""
+    mine = (cloud.points[cloud.labels == 1].astype(np.float64) for cloud in clouds)
+    return np.concatenate([np.empty((0, 3)), *mine])
+
+
+def points_near(frames: Sequence[Frame], sighting: Sighting) -> Array:
+    """Return the points (n, 3) of the detection nearest to an object in the newest frame; none without a cloud."""
+    frame = next((frame for frame in reversed(frames) if frame.cloud is not None), None)
+    near = [d for d in frame.detections if apart(d, sighting.target) < SAME_PLACE] if frame is not None else []
+    if frame is None or frame.cloud is None or not near:
+        return np.empty((0, 3))
+    nearest = min(near, key=lambda d: apart(d, sighting.target))
+    number = frame.detections.index(nearest) + 1
+    return frame.cloud.points[frame.cloud.labels == number].astype(np.float64)
+
+
+def cluster_frames(frames: Sequence[Frame], place: Array) -> tuple[ClusterFrame, ...]:
+    """Return the clusters of frames; those without a cloud are left out.
+
+    Args:
+        frames: In the base frame.
+        place: (2,) or (3,) the place that is asked about.
+    """
+    return tuple(_clusters(frame, frame.cloud, place) for frame in frames if frame.cloud is not None)
+
+
+def _clusters(frame: Frame, cloud: LabelledCloud, place: Array) -> ClusterFrame:
+    found: list[Cluster] = []
+    for number, detection in enumerate(frame.detections, start=1):
+        points = cloud.points[cloud.labels == number].astype(np.float64)
+        if len(points) >= _LEAST_POINTS:
+            found.append(Cluster.of(points, cut=not detection.measured))
+    near = np.linalg.norm(cloud.points[:, :2] - np.asarray(place[:2], np.float32), axis=1) < _IN_VIEW
+    return ClusterFrame(frame.t_ns, tuple(found), bool(near.any()))
+
+
+def _view(clouds: Sequence[LabelledCloud], table_z: float) -> View:
+    points = np.concatenate([cloud.points for cloud in clouds]).astype(np.float64)
+    labels = np.concatenate([cloud.labels for cloud in clouds])
+    target, standing = points[labels == 1], points[:, 2] > table_z + _TABLE
+    others = np.flatnonzero((labels != 1) & standing)
+    fringe = np.zeros(len(others), np.bool_)
+    loose = labels[others] == 0
+    if len(target) and loose.any():
+        away, _ = KDTree(target).query(points[others[loose]])
+        fringe[loose] = away < _FRINGE
+    return View(clouds[-1].camera, target, points[others[~fringe]], points[(labels != 1) & ~standing])
