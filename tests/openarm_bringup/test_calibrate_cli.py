@@ -65,7 +65,7 @@ def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_p
     assert drawn == ["poses of the", "marks in the", "residuals of the"]
     figures = [b64decode(data) for data in re.findall(r"data:image/svg\+xml;base64,([^\"]+)", text)]
     assert [ElementTree.fromstring(figure).tag for figure in figures] == ["{http://www.w3.org/2000/svg}svg"] * 3
-    assert text.count('class="gauge"') == 9
+    assert text.count('class="gauge"') == 7
     assert text.count('class="bar"') == 2 * 12
     assert "http" not in text.replace("http-equiv", "")
     code, out, _ = run(capsys, "check", str(session_file), "--json")

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from openarm_calibration.foreign.conventions import ROTATIONS, Convention, candidates, guess, is_ambiguous
 from openarm_calibration.handeye.pose_pairs import PosePairs, solve_pairs
-from openarm_calibration.handeye.problem import difference
 from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.handeye.transforms import difference
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from tests.openarm_calibration import foreign_files as files

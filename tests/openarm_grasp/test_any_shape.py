@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Things of any shape in simulated physics: found by depth, grasped on their clouds, judged by points and fingers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from openarm_common.labelled_cloud import LabelledCloud
+from openarm_common.scene.scene import Scene, load_scene, parse_scene
+from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.tasks.task import Task
+from openarm_evaluation.campaign.trial import Trials
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.perception.clouds import views_of
+
+
+def alone(name: str, x: float, y: float, yaw: float) -> Scene:
+    """A scene with one object of models/objects on its most frequent side."""
+    item = {"name": name, "shape": "mesh", "object": name, "side": 0, "position": [x, y], "yaw": yaw}
+    table = load_scene("empty").table.model_dump()
+    return parse_scene({"name": "alone", "table": table, "objects": [item]}, "alone")
+
+
+@pytest.mark.parametrize(("name", "y"), [("banana", -0.22), ("pear", 0.20)])
+def test_what_is_no_prism_is_grasped_on_its_cloud_and_placed(name: str, y: float) -> None:
+    senses = SimulatedSenses(depth_noise=True, detector="anything")
+    trials = Trials(Task("nominal", 1, alone(name, 0.27, y, 0.4), ("anything",)), senses, GraspConfig())
+    (grasp,) = trials.run()["grasps"]
+    assert grasp["outcome"] == "placed", grasp["message"]
+    said = " ".join(step.reason for step in trials.steps)
+    assert "/cloud" in said
+    assert "the cluster has gone from its place" in said
+    assert "mm from its target" in said
+
+
+def test_images_of_one_camera_are_one_view_and_the_border_of_the_object_is_no_obstacle() -> None:
+    points = np.array([[0.3, 0.0, 0.45], [0.306, 0.0, 0.446], [0.35, 0.0, 0.44], [0.3, 0.1, 0.40]], np.float32)
+    labels = np.array([1, 0, 2, 0], np.uint32)
+    over, hand = np.array([0.5, 0.0, 1.1]), np.array([0.3, 0.0, 0.7])
+    clouds = [LabelledCloud(points, labels, camera) for camera in (over, over + 0.0005, hand)]
+    first, second = views_of(clouds, 0.40)
+    assert (len(first.target), len(first.others), len(first.table)) == (2, 2, 2)
+    assert (len(second.target), len(second.others), len(second.table)) == (1, 1, 1)
+    assert np.allclose(first.others[:, 0], 0.35)
