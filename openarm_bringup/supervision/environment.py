@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 import yaml
 
@@ -96,6 +97,17 @@ def profiled(profile: Path) -> Iterator[None]:
             os.environ[PROFILE] = before
 
 
+def of_one_type(value: object) -> object:
+    """Return a value of a parameter; of a list with whole numbers and others all as others, since rcl takes one type."""
+    if not isinstance(value, list):
+        return value
+    items = cast("list[object]", value)
+    numbers = all(isinstance(item, int | float) and not isinstance(item, bool) for item in items)
+    if not numbers or not any(isinstance(item, float) for item in items):
+        return items
+    return [float(cast("float", item)) for item in items]
+
+
 def node_arguments(graph: Graph, name: str, run_dir: Path) -> list[str]:
     """Return the command line of one node; writes its parameters to a file in the run folder."""
     spec = graph.node(name)
@@ -107,6 +119,7 @@ def node_arguments(graph: Graph, name: str, run_dir: Path) -> list[str]:
     ros += [part for old, new in spec.remaps.items() for part in ("-r", f"{old}:={new}")]
     if params := graph.parameters(name):
         path = run_dir / "params" / f"{name}.yaml"
+        params = {key: of_one_type(value) for key, value in params.items()}
         _keep(path, yaml.safe_dump({name: {"ros__parameters": params}}, sort_keys=False))
         ros += ["--params-file", str(path)]
     return [*argv, "--ros-args", *ros]

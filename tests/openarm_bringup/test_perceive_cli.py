@@ -15,6 +15,8 @@ from openarm_common.camera.cameras import Intrinsics
 from openarm_perception.frames.pcd import OrganisedCloud, read_pcd, write_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
+pytestmark = pytest.mark.requirement("R-19")
+
 LENS = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
 #: Camera 0.7 m over the table, looking straight down; a red box of 80 x 60 x 50 mm.
 DISTANCE, HALF, HEIGHT = 0.7, (0.04, 0.03), 0.05

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup.supervision.environment import node_arguments, node_environment, write_profile
+from openarm_bringup.supervision.environment import node_arguments, node_environment, of_one_type, write_profile
 from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_bringup.supervision.shm import (
     SHM,
@@ -180,3 +180,18 @@ def test_a_process_whose_threads_hang_leaves_with_its_exit_code_and_nothing_of_i
     names = done.stdout.split()
     assert len(names) >= 2
     assert [name for name in names if (SHM / name).exists()] == []
+
+
+@pytest.mark.parametrize(
+    ("value", "written"),
+    [
+        ([0.0, 1, -2.5], "[0.0, 1.0, -2.5]"),
+        ([1, 2], "[1, 2]"),
+        (["a", 1], "['a', 1]"),
+        ([True, False], "[True, False]"),
+        (3, "3"),
+    ],
+)
+def test_a_list_with_a_whole_number_among_others_is_of_one_type(value: object, written: str) -> None:
+    """Of [0.0, 1] rcl says "sequence should be of same type", and the node does not start."""
+    assert str(of_one_type(value)) == written

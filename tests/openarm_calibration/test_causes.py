@@ -24,6 +24,8 @@ from openarm_calibration.handeye.unknowns import Noise
 from openarm_calibration.handeye.verdict import Limits, accuracy, assess
 from openarm_common import se3
 
+pytestmark = pytest.mark.requirement("R-13")
+
 
 @pytest.mark.parametrize("kind", list(KINDS), ids=[kind.__name__ for kind in KINDS])
 @pytest.mark.requirement("A-41", "N-07")

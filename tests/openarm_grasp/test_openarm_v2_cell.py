@@ -13,7 +13,7 @@ from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 
 
-@pytest.mark.requirement("R-04")
+@pytest.mark.requirement("R-05")
 @pytest.mark.parametrize(("camera", "label", "side"), [("ceiling", "blue", "left"), ("head_left", "red", "right")])
 def test_it_places_an_object_of_its_scene(monkeypatch: pytest.MonkeyPatch, camera: str, label: str, side: str) -> None:
     """`head_left` has no depth of its own: it is matched with `head_right`."""

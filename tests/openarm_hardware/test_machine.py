@@ -14,6 +14,8 @@ from openarm_common.motors import frames
 from openarm_hardware.arm import Phase
 from tests.openarm_hardware.bench import PERIOD_NS, Bench
 
+pytestmark = pytest.mark.requirement("R-08")
+
 UP = [Phase.FOLLOWING, Phase.FOLLOWING]
 HALF = [Phase.DAMPED, Phase.HELD]
 

@@ -126,7 +126,7 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> SimRobot:
     return robot
 
 
-@pytest.mark.requirement("R-04")
+@pytest.mark.requirement("R-05")
 def test_the_tool_goes_to_a_pose_in_the_base_frame_at_any_height(simulated: SimRobot) -> None:
     """Planned from measured joints, carried out by the simulated robot, seen in the simulation itself."""
     down = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.42, -0.25, 1.30))
@@ -138,7 +138,7 @@ def test_the_tool_goes_to_a_pose_in_the_base_frame_at_any_height(simulated: SimR
     assert at(simulated) == pytest.approx(0.12, abs=0.001)
 
 
-@pytest.mark.requirement("R-04")
+@pytest.mark.requirement("R-05")
 def test_the_lift_moves_with_both_arms_and_what_is_planned_next_is_of_its_new_height(simulated: SimRobot) -> None:
     joints = [name for arm in simulated.description.arms.values() for name in arm.joints]
     columns = simulated.columns(joints)

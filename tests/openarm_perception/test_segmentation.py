@@ -15,6 +15,8 @@ from openarm_perception.segmentation.support import find_support
 from openarm_perception.segmentation.views import merge_views
 from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
 
+pytestmark = pytest.mark.requirement("R-19")
+
 LIMITS = DepthLimits(near=0.1, far=3.0)
 
 

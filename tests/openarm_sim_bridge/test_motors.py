@@ -25,6 +25,8 @@ from openarm_sim_bridge.world.hardware import HardwareConfig
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
 
+pytestmark = pytest.mark.requirement("R-10")
+
 UP = [Phase.FOLLOWING, Phase.FOLLOWING]
 
 
