@@ -98,7 +98,7 @@ def profiled(profile: Path) -> Iterator[None]:
 
 
 def of_one_type(value: object) -> object:
-    """Return a value of a parameter; of a list with whole numbers and others all as others, since rcl takes one type."""
+    """Return a value of a parameter; whole numbers in a list with others become such: rcl takes lists of one type."""
     if not isinstance(value, list):
         return value
     items = cast("list[object]", value)
