@@ -21,6 +21,7 @@ from openarm_common.octree.distance_field import DistanceField
 from openarm_common.types import Array
 from openarm_grasp.config import ApproachConfig, CloudConfig
 from openarm_grasp.sampling import antipodal_kernels as kernels
+from openarm_grasp.sampling import ranking_kernels
 from openarm_grasp.sampling.hand_shape import HandShape
 from openarm_grasp.sampling.surface import Surface
 from openarm_grasp.sampling.voxel_kernels import SHADOW, boundary
@@ -250,7 +251,7 @@ class Search:
             return ()
         found = found[np.argsort(-self._scores(found)[0], kind="stable")]
         step, shape, surface = self._surface.step, self._shape, self._surface
-        apart = kernels.distinct(found, _APART / step, cos(_TURNED), len(found))
+        apart = ranking_kernels.distinct(found, _APART / step, cos(_TURNED), len(found))
         found = found[apart]
         scores, parts = self._scores(found)
         seen = surface.middles(np.argwhere((surface.cells > 0) & (surface.cells < SHADOW)))
@@ -261,7 +262,7 @@ class Search:
             T[:3] = found[row, :12].reshape(3, 4)
             T[:3, 3] = surface.low + T[:3, 3] * step
             R, p = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
-            if kernels.inside(seen, R, p, shape.planes, shape.starts, low, high) or not self._clear_of_map(T):
+            if ranking_kernels.inside(seen, R, p, shape.planes, shape.starts, low, high) or not self._clear_of_map(T):
                 continue
             best.append(self._grasp(found[row], T, float(scores[row]), {n: float(v[row]) for n, v in parts.items()}))
             if len(best) == self._config.best:
