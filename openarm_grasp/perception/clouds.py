@@ -30,7 +30,7 @@ def views_of(clouds: Sequence[LabelledCloud], table_z: float) -> tuple[View, ...
     """Return what each camera has seen of an object and around it, its images put together.
 
     Args:
-        clouds: As of a `Sighting`.
+        clouds: As of a `Sighting`; the first is of the camera over the table, which looks at all around the object.
         table_z: Height of the table top.
     """
     cameras: list[list[LabelledCloud]] = []
@@ -41,7 +41,7 @@ def views_of(clouds: Sequence[LabelledCloud], table_z: float) -> tuple[View, ...
             cameras.append([cloud])
         else:
             group.append(cloud)
-    return tuple(_view(group, table_z) for group in cameras)
+    return tuple(_view(group, table_z, whole=number == 0) for number, group in enumerate(cameras))
 
 
 def cluster_of(sighting: Sighting) -> Cluster:
@@ -91,7 +91,7 @@ def _clusters(frame: Frame, cloud: LabelledCloud, place: Array) -> ClusterFrame:
     return ClusterFrame(frame.t_ns, tuple(found), bool(near.any()))
 
 
-def _view(clouds: Sequence[LabelledCloud], table_z: float) -> View:
+def _view(clouds: Sequence[LabelledCloud], table_z: float, *, whole: bool) -> View:
     points = np.concatenate([cloud.points for cloud in clouds]).astype(np.float64)
     labels = np.concatenate([cloud.labels for cloud in clouds])
     target, standing = points[labels == 1], points[:, 2] > table_z + _TABLE
@@ -101,4 +101,4 @@ def _view(clouds: Sequence[LabelledCloud], table_z: float) -> View:
     if len(target) and loose.any():
         away, _ = KDTree(target).query(points[others[loose]])
         fringe[loose] = away < _FRINGE
-    return View(clouds[-1].camera, target, points[others[~fringe]], points[(labels != 1) & ~standing])
+    return View(clouds[-1].camera, target, points[others[~fringe]], points[(labels != 1) & ~standing], whole)

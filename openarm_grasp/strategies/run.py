@@ -135,7 +135,10 @@ class Run:
         except OpenArmError as error:
             if error.code is not Code.TOO_WIDE or not (spared and sighting.clouds):
                 raise
-            offered = sampler.candidates(self.asked(arm, sighting))
+            try:
+                offered = sampler.candidates(self.asked(arm, sighting))
+            except OpenArmError:
+                raise error from None  # a prism that is too wide is just that
         return retries.among(offered, target, self.failed)
 
     def asked(self, arm: str, sighting: Sighting) -> Sampling:
