@@ -6,14 +6,15 @@ The motors are commanded by a process of their own (`openarm_hardware.servo`); h
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future as ThreadFuture
 from typing import Any
 
 import numpy as np
 
 from openarm_common.errors import OpenArmError
-from openarm_common.motors.bus import emulated_buses
+from openarm_common.motors.bus import emulated_buses, open_bus
 from openarm_common.motors.wiring import Wiring, axes_of, load_wiring
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ArmLoad, ServoModel
@@ -33,6 +34,8 @@ from openarm_hardware.exchange import BIN_S, State
 from openarm_hardware.loop import MotorRobot
 from openarm_hardware.posture import LastPosture
 
+#: An emulator that starts at the same time has this long, s.
+_EMULATOR_S = 30.0
 #: Motors that are within this of being too hot are warned of, °C.
 _WARM = 10
 
@@ -51,6 +54,8 @@ class OpenArmHardware(ControlNode[HardwareNodeConfig]):
         wiring, loads = load_wiring(), arm_loads(description)
         sockets = emulated_buses(self.context.get_domain_id(), description.arm_names, config.motor_sockets)
         self._axes = axes_of(wiring, description, sockets if config.emulated else None)
+        if config.emulated:
+            _await_buses(sockets.values(), flexible=wiring.flexible)
         self._settings = config.motors.settings(flexible=wiring.flexible)
         self._posture = LastPosture(config.calibrations, "_emulated" if config.emulated else "")
         seed = None if config.dynamics_seed < 0 else config.dynamics_seed
@@ -176,6 +181,24 @@ def percentiles(bins: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[float, float
         return 0.0, 0.0
     p50, p99 = (int(np.searchsorted(np.cumsum(bins), share * total)) for share in (0.5, 0.99))
     return (p50 + 1) * BIN_S, (p99 + 1) * BIN_S
+
+
+def _await_buses(addresses: Iterable[str], *, flexible: bool) -> None:
+    """Wait until an emulator, which starts at the same time, serves its buses.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when it does not within half a minute.
+    """
+    deadline = time.monotonic() + _EMULATOR_S
+    for address in addresses:
+        while True:
+            try:
+                open_bus(address, flexible=flexible).close()
+                break
+            except OpenArmError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.1)
 
 
 def _servo_model(config: HardwareNodeConfig, wiring: Wiring, robot: RobotDescription, load: ArmLoad) -> ServoModel:
