@@ -181,7 +181,7 @@ def measured(rate: float, fifo: bool, seconds: float, trials: int, silent: int) 
 
 
 def _stop(bench: Bench) -> float:
-    """Return the time from a stop to the last joint that was told to hold, ms; not a number: it was not seen."""
+    """Return the time from a stop to the last joint that was commanded to hold, ms; not a number: it was not seen."""
     bench.up()
     bench.back()
     bench.ask(forget=True)
@@ -197,7 +197,7 @@ def _stop(bench: Bench) -> float:
 
 
 def _silence(bench: Bench) -> float:
-    """Return the time from the last reply of a motor to the last joint of its arm that was told to sink, ms."""
+    """Return the time from the last reply of a motor to the last joint of its arm that was commanded to sink, ms."""
     bench.up()
     bench.back()
     bench.ask(forget=True)
@@ -217,7 +217,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--trials", type=int, default=30)
-    parser.add_argument("--load", type=int, default=1, help="busy processes beside it")
+    parser.add_argument("--load", type=int, default=1, help="busy processes that run meanwhile")
     parser.add_argument("--silent", type=int, default=3, help="replies left out that stop an arm")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()

@@ -5,7 +5,7 @@
 
 FOLDER holds a JSON file for each set, in SI units: `camera` (width, height, K), `setup` (eye_in_hand or eye_to_hand),
 `chain` (base and tip link), and `samples`, each with `T_base_tip`, `corners_px`, `corners_board_m`, and, where joint
-zeros can be estimated, `joint_positions`. Nobody knows the true mounts: each view is left out in turn and predicted
+zeros can be estimated, `joint_positions`. The true mounts are not known: each view is left out in turn and predicted
 by the answer of the others, in px, and in mm and degrees against the pose of its own corners.
 """
 

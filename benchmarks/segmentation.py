@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segmentation of labelled organised clouds, beside Euclidean clustering over the plane, in the same run.
+"""Segmentation of labelled organised clouds, compared with Euclidean clustering over the plane, in the same run.
 
     python benchmarks/segmentation.py FOLDER [--support LABELS] [--repeats N] [--pictures OUT] [--json PATH]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth of a stereo pair against true depth, beside plain StereoSGBM without checks on the same images.
+"""Depth of a stereo pair against true depth, compared with plain StereoSGBM without checks on the same images.
 
     python -m benchmarks.stereo_depth [--scenes N] [--baseline M] [--fovy DEG] [--json PATH]
 

@@ -19,7 +19,7 @@ from openarm_hardware.settings import Settings
 
 #: A motor that is not on after so long does not switch on, s.
 _ENABLE_S = 1.0
-#: It is told again after so many cycles.
+#: The frame is repeated after so many cycles.
 _AGAIN = 10
 #: So many motors are named in a sentence.
 _NAMED = 3
@@ -68,7 +68,7 @@ class ArmMachine:
         self._since_ns = 0
         #: Its motors are on and damped while it looks: it was reset.
         self._sinks = False
-        #: Somebody has looked, so that errors of motors may be cleared.
+        #: A reset was asked for, so that errors of motors may be cleared.
         self._clears = False
         #: Its motors were switched on here.
         self._was_on = False
@@ -114,7 +114,7 @@ class ArmMachine:
         return out
 
     def frames(self) -> list[Frame]:
-        """Return what the motors are told in the present phase."""
+        """Return the frames of the present phase."""
         phase, again = self.phase, self._cycles % _AGAIN == 0
         if phase in (Phase.DAMPED, Phase.RELEASING):
             return [motor.damping_frame() for motor in self.motors]
@@ -129,7 +129,7 @@ class ArmMachine:
 
     # --- what others ask
     def fail(self, why: str, now_ns: int) -> None:
-        """Let the arm sink softly, because its state can't be trusted or a motor does not do as it is told."""
+        """Let the arm sink softly, because its state can't be trusted or a motor does not follow its command."""
         if self.phase in (Phase.ENABLING, Phase.RAMPING, Phase.FOLLOWING, Phase.HELD):
             self._become(Phase.DAMPED, why, now_ns)
 

@@ -67,7 +67,7 @@ class MotorDriver:
         return time.time_ns()
 
     def take(self) -> JointReadout | None:
-        """See `Driver.take`; motors that are not followed yet are told where they are."""
+        """See `Driver.take`; motors that are not followed yet are commanded to where they are."""
         state = self.servo.state()
         before = self.state
         if state is None or any(motor.status < 0 for motor in state.motors):

@@ -66,11 +66,11 @@ class LooseJoints:
 
 
 class WatchedServer(BusServer):
-    """Notes when joints are told to hold or to damp; arguments as `BusServer`."""
+    """Notes when joints are commanded to hold or to damp; arguments as `BusServer`."""
 
     def __init__(self, buses: EmulatedBuses, advance: Callable[[int], None], *, flexible: bool = True) -> None:
         super().__init__(buses, advance, flexible=flexible)
-        #: Time at which each motor was first told to hold or to damp since it was last emptied.
+        #: Time at which each motor was first commanded to hold or to damp since it was last emptied.
         self.held = dict[str, int]()
         self._before = dict[str, float]()
 

@@ -67,7 +67,7 @@ class EmulatedRobot(JointController):
         return state.position
 
     def effort_limits(self) -> Array:
-        """See `JointController.effort_limits`: of what the motors were told last."""
+        """See `JointController.effort_limits`: of what the motors were commanded last."""
         return self._limits
 
     def reset(self, state: JointReadout) -> None:

@@ -18,7 +18,7 @@ from openarm_common.types import Array
 
 Grey = NDArray[np.uint8]
 
-#: Fewest marks from which a field of degree 3, 2 is told from errors of single marks.
+#: Fewest marks from which a field of degree 3, 2 is distinguished from errors of single marks.
 _CUBIC, _QUADRATIC = 18, 12
 #: What marks may be off, px: always; by the blur (its sd); by the noise over contrast, times blur; by the pitch, for
 #: boards that are not quite flat or not quite printed to scale.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motors behind an emulated bus: they take frames and answer them; what they move is somebody else's.
+"""Motors behind an emulated bus: they take frames and answer them; what they move is up to the caller.
 
 What a motor does with a frame is that of the documents named in `frames`; what they leave open is assumed so: reading,
 writing and refreshing are answered by a motor that is off, too, a command for another control mode is answered and not

@@ -360,7 +360,7 @@ class _Grid:
         low, high = box[:, 1] + at[1]
         inside = (ends[..., 0] < ends[..., 1]) & (ends[..., 1] > low) & (ends[..., 0] < high)
         if (inside & ((ends[..., 0] < low) | (ends[..., 1] > high))).any():
-            return None  # it reaches into the room that is kept beside the fingers
+            return None  # it reaches into the clearance of the fingers
         met = inside.any(axis=0)
         if not met.any():
             return None

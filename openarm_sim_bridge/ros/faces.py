@@ -135,7 +135,7 @@ class OpenArmRos2Face(Face):
 
 
 class MotorFace(Face):
-    """No controllers: motors take frames from local sockets, and arms hang until somebody commands them.
+    """No controllers: motors take frames from local sockets, and arms hang until a client commands them.
 
     Args:
         node: Owner.
