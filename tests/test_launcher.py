@@ -130,7 +130,7 @@ def test_set_up_hands_over_its_arguments_and_the_next_run_does_nothing(machine: 
     assert first.stdout == "args: demo --seeds 0-3\nPYTHONPATH: unset\n"
     assert "set up" in first.stderr
     calls = machine.uv_calls()
-    assert sum(call.startswith("build --wheel --no-build-isolation") for call in calls) == 5
+    assert sum(call.startswith("build --wheel --no-build-isolation") for call in calls) == 7
     assert any("pip sync" in call and "--require-hashes" in call for call in calls)
     assert list(machine.cache.glob("openarm/tmp.*")) == []
 
