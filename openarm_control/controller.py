@@ -200,6 +200,13 @@ class RobotController(JointController):
         for side, carrier in carriers.items():
             self.arms[side].carry_by(carrier)
 
+    def commanded(self) -> Array:
+        """Return where the joints (n,) should be now; their targets are off by what carries the arms."""
+        positions = self._targets.copy()
+        for follower, at in self._followers:
+            positions[at] = follower.commanded
+        return positions
+
     def effort_limits(self) -> Array:
         """Return the effort limits (n,) of the joints, N or N m; infinite but for those of the grippers."""
         limits = np.full(len(self.joint_names), np.inf)

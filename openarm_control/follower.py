@@ -85,6 +85,11 @@ class Follower(ABC):
         self._target: Array = command.position.copy()
 
     @property
+    def commanded(self) -> Array:
+        """Where the joints (k,) should be now."""
+        return self._command.position
+
+    @property
     @abstractmethod
     def busy(self) -> bool:
         """Whether a goal is being followed."""

@@ -25,6 +25,8 @@ _AGAIN = 10
 _NAMED = 3
 #: Joints that are slower than this rest, rad/s.
 _RESTS = 0.05
+#: Motors that have left out so many replies in a row are not waited for.
+_GONE = 250
 
 
 class Phase(IntEnum):
@@ -247,7 +249,7 @@ class ArmMachine:
 
     def _release(self, now_ns: int) -> None:
         passed = (now_ns - self._since_ns) * 1e-9
-        rests = all(abs(motor.dq) < _RESTS for motor in self.motors if not motor.axis.grips)
+        rests = all(abs(motor.dq) < _RESTS or motor.missed > _GONE for motor in self.motors if not motor.axis.grips)
         if passed > self._settings.release_s or (rests and passed > 0.5):
             self._become(Phase.OFF, self.text, now_ns)
 

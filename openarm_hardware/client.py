@@ -19,6 +19,8 @@ from openarm_hardware.settings import Settings
 
 #: The process answers within this, s.
 _START_S = 20.0
+#: Longest reason of a stop, characters.
+_REASON = 300
 
 
 class ServoProcess:
@@ -77,17 +79,17 @@ class ServoProcess:
         """Command position and torque of each joint."""
         self._exchange.write_command(Command(time.monotonic_ns(), tuple(joints)))
 
-    def stop(self) -> None:
-        """Hold all arms where they are, within a period, until `reset`."""
-        self._tell(b"h")
+    def stop(self, why: str = "") -> None:
+        """Hold all arms where they are, within a period, until `reset`; without a reason, as the emergency stop."""
+        self._tell(f"h {' '.join(why.split())[:_REASON]}".encode() + b"\n")
 
     def reset(self) -> None:
         """Let arms go on whose cause of a stop is gone."""
-        self._tell(b"r")
+        self._tell(b"r\n")
 
     def close(self, timeout_s: float = 15.0) -> None:
         """Let the arms sink, switch their motors off and end the process."""
-        self._tell(b"q")
+        self._tell(b"q\n")
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout_s)
         self.abandon()
@@ -102,10 +104,10 @@ class ServoProcess:
             if stream is not None:
                 stream.close()
 
-    def _tell(self, letters: bytes) -> None:
+    def _tell(self, line: bytes) -> None:
         assert self._process.stdin is not None
         with suppress(OSError, ValueError):  # of a process that has ended, which `alive` shows
-            self._process.stdin.write(letters)
+            self._process.stdin.write(line)
 
     def _answer(self) -> str:
         assert self._process.stdout is not None

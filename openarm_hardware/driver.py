@@ -21,6 +21,7 @@ from openarm_control.joints import JointReadout
 from openarm_hardware.arm import Phase
 from openarm_hardware.client import ServoProcess
 from openarm_hardware.exchange import State
+from openarm_hardware.touch import TouchGuard
 
 #: Most that the position of an arm's joint changes from one command to the next, rad. Controllers that give a goal up
 #: take their corrections back at once; the servo refuses a larger step as a fault of its client.
@@ -36,6 +37,7 @@ class MotorDriver:
         servo: Commands the motors; may be exchanged for another one.
         controller: Whose joints they are.
         loads: Of the arms, by name.
+        guard: Refuses commands.
         publish: Called with each new joint state.
     """
 
@@ -44,10 +46,11 @@ class MotorDriver:
         servo: ServoProcess,
         controller: RobotController,
         loads: Mapping[str, ArmLoad],
+        guard: TouchGuard,
         publish: Callable[[JointReadout], None],
     ) -> None:
         self.servo = servo
-        self._controller, self._publish = controller, publish
+        self._controller, self._guard, self._publish = controller, guard, publish
         axes = {axis.joint: axis for axis in servo.axes}
         self._axes: Sequence[Axis] = [axes[name] for name in controller.joint_names]
         self._arm_of = list(dict.fromkeys(axis.arm for axis in servo.axes))
@@ -82,6 +85,7 @@ class MotorDriver:
             self._weight[at] = load.torque(readout.position[at], rest, rest)
         if any(phase != Phase.FOLLOWING for phase in state.phases):
             self._position = np.full(len(self._axes), np.nan)
+            self._guard.begin()
             self._stay(state, readout.position)
         self._publish(readout)
         return readout
@@ -102,7 +106,10 @@ class MotorDriver:
         return self._with_torque(command[:, 0], command[:, 1], 1.0)
 
     def send(self, targets: Array) -> None:
-        """See `Driver.send`."""
+        """See `Driver.send`; a command that would let the robot touch itself stops the arms instead."""
+        if why := self._touches():
+            self.servo.stop(why)
+            return
         torque = self._weight.copy()
         limits = self._controller.effort_limits()[self._fingers]
         torque[self._fingers] = np.minimum(limits, self._torque[self._fingers])
@@ -112,6 +119,14 @@ class MotorDriver:
             position = np.where(arms, np.clip(position, before - _STEP, before + _STEP), position)
         self._position = position
         self.servo.command(list(zip(position.tolist(), torque.tolist(), strict=True)))
+
+    def _touches(self) -> str:
+        """Return why the robot would touch itself, else nothing; fingers are where they are, whatever is commanded."""
+        assert self.state is not None
+        position, velocity = np.array([(motor.q, motor.dq) for motor in self.state.motors]).T
+        command = self._controller.commanded()
+        command[self._fingers] = position[self._fingers]
+        return self._guard.refused(command, position, velocity)
 
     def _with_torque(self, positions: Array, torques: Array, sign: float) -> Array:
         """Return positions that are off by what torques move, where a gain moves them."""

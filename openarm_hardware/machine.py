@@ -59,11 +59,11 @@ class Machine:
         self._spread(now_ns)
         return out
 
-    def stop(self, now_ns: int, received: Sequence[Sequence[Frame]]) -> list[list[Frame]]:
+    def stop(self, now_ns: int, received: Sequence[Sequence[Frame]], why: str = STOPPED) -> list[list[Frame]]:
         """Hold all arms where they are, until `reset`; return the frames that do so, to be sent at once."""
         for arm, came in zip(self.arms.values(), received, strict=True):
             arm.receive(came, now_ns)
-            arm.hold(STOPPED, now_ns)
+            arm.hold(why, now_ns)
         return [arm.frames() for arm in self.arms.values()]
 
     def reset(self, now_ns: int) -> None:
@@ -90,6 +90,8 @@ class Machine:
     def text(self) -> str:
         """Why arms wait, hold or sink."""
         said = [f"{name}: {arm.text}" for name, arm in self.arms.items() if arm.text]
+        if len(set(texts := [arm.text for arm in self.arms.values()])) == 1 and texts[0]:
+            said = texts[:1]
         return "; ".join([*said, *filter(None, (self._answer, self._late))])
 
     def motors(self) -> tuple[MotorState, ...]:

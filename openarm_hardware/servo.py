@@ -2,7 +2,7 @@
 """The process that commands the motors: one thread, one wake a cycle, no ROS and no numpy.
 
 Its client (`openarm_hardware.client`) starts it with `python -m openarm_hardware.servo FD`, gives it a line of JSON on
-its standard input and then single letters: h holds at once, r resets, q lets the arms sink and ends. It answers with
+its standard input and then lines: `h WHY` holds at once, `r` resets, `q` lets the arms sink and ends. It answers with
 one line when it runs. What it sees and what it should do is in the memory of FD (`Exchange`). When its input ends
 without a q, the client has died: the arms are held for a while, and a new client may take them over meanwhile.
 """
@@ -26,7 +26,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.motors.axis import Axis
 from openarm_common.motors.bus import Bus, Frame, open_bus
 from openarm_hardware.exchange import BIN_S, BINS, Exchange, State
-from openarm_hardware.machine import Machine
+from openarm_hardware.machine import STOPPED, Machine
 from openarm_hardware.settings import Settings
 
 #: A bus that is gone is opened again after so long, ns.
@@ -158,6 +158,7 @@ class Servo:
         self._woke_ns = 0
         self._orphan_ns: int | None = None
         self._input: list[Any] = [sys.stdin.fileno()]
+        self._rest = b""
 
     def run(self) -> None:
         """Run until the arms are released, or another process takes them over."""
@@ -208,25 +209,28 @@ class Servo:
             if self._owner.asked(ready) and self._orphan_ns is not None:
                 return True
             if self._input and self._input[0] in ready:
-                self._take(os.read(self._input[0], 64))
+                self._take(os.read(self._input[0], 4096))
         return False
 
-    def _take(self, letters: bytes) -> None:
+    def _take(self, data: bytes) -> None:
         now_ns = time.monotonic_ns()
-        if not letters:
+        if not data:
             self._input.clear()
             if not self._machine.ended:
                 self._orphan_ns = now_ns
                 self._machine.hold("the client has ended", now_ns)
-        if b"h" in letters:
-            frames = self._machine.stop(now_ns, [link.receive() for link in self._links])
-            for link, mine in zip(self._links, frames, strict=True):
-                link.send(mine)
-            self._publish(now_ns)
-        if b"r" in letters:
-            self._machine.reset(now_ns)
-        if b"q" in letters:
-            self._machine.release("released", now_ns)
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            what, _, why = line.decode(errors="replace").partition(" ")
+            if what == "h":
+                frames = self._machine.stop(now_ns, [link.receive() for link in self._links], why or STOPPED)
+                for link, mine in zip(self._links, frames, strict=True):
+                    link.send(mine)
+                self._publish(now_ns)
+            elif what == "r":
+                self._machine.reset(now_ns)
+            elif what == "q":
+                self._machine.release("released", now_ns)
 
 
 def schedule(priority: int) -> str:

@@ -83,7 +83,8 @@ class Register(IntEnum):
 
 #: Registers whose value is a whole number; the others are floats.
 WHOLE = frozenset({7, 8, 9, 10, 13, 14, 15, 16, 35, 36})
-#: Step of the register TIMEOUT, s. The manual names none; motorbridge takes 50 µs, another project 1 ms.
+#: Step of the register TIMEOUT, s: by the documentation of python-damiao-driver (registers.md, register 9) and the code
+#: of motorbridge. The manual names none, and no motor was asked yet.
 TIMEOUT_STEP_S = 50e-6
 
 

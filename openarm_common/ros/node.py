@@ -9,9 +9,10 @@ import socket
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future as ThreadFuture
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import wraps
 from inspect import iscoroutinefunction
 from typing import Any, Generic, ParamSpec, TypeVar, get_args
@@ -24,6 +25,7 @@ from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -87,6 +89,16 @@ def offered_qos(node: Node, topic: str, depth: int) -> QoSProfile:
     dependable = bool(profiles) and all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
     latched = bool(profiles) and all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
     return _profile(depth, reliable=dependable, latched=latched)
+
+
+@contextmanager
+def until_shutdown(context: Context) -> Iterator[None]:
+    """Let publishing in a thread fail when a signal has shut the context down in the meantime."""
+    try:
+        yield
+    except rclpy_implementation.RCLError:
+        if context.ok():
+            raise
 
 
 class BaseNode(Node, Generic[ConfigT]):

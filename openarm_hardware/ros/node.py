@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from openarm_common.collision.self_collision import SelfCollision
 from openarm_common.errors import OpenArmError
 from openarm_common.motors.bus import emulated_buses, open_bus
 from openarm_common.motors.wiring import Wiring, axes_of, load_wiring
@@ -33,6 +34,7 @@ from openarm_hardware.driver import MotorDriver
 from openarm_hardware.exchange import BIN_S, State
 from openarm_hardware.loop import MotorRobot
 from openarm_hardware.posture import LastPosture
+from openarm_hardware.touch import TouchGuard
 
 #: An emulator that starts at the same time has this long, s.
 _EMULATOR_S = 30.0
@@ -75,7 +77,9 @@ class OpenArmHardware(ControlNode[HardwareNodeConfig]):
         )
         self._states = RobotPublisher(self, description, names)
         self._tf_ticks = RateDivider(config.tf_rate)
-        self._driver = MotorDriver(self._start_servo(self._posture.read()), self._controller, loads, self._publish)
+        guard = TouchGuard(SelfCollision(description, names))
+        servo = self._start_servo(self._posture.read())
+        self._driver = MotorDriver(servo, self._controller, loads, guard, self._publish)
         self._loop = MotorRobot(self._controller, self._driver, config.stale_after, self._observe, self.on_crash)
         self._controllers = Controllers(self, self._loop, self._controller, servos, config.gripper_action)
         self._periods: Sequence[int] = ()

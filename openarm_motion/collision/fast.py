@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from openarm_common import se3
+from openarm_common.collision.self_collision import shape_radius
+from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision import clearance_kernels as kernels
@@ -23,7 +25,6 @@ from openarm_motion.collision.clearance_kernels import Model, workspace
 from openarm_motion.collision.exact import CollisionScene
 from openarm_motion.collision.line_kernels import line_free
 from openarm_motion.collision.occupancy import DistanceMap
-from openarm_motion.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE
 from openarm_motion.collision.solids import Box, Cylinder, Mesh, Solid, Sphere
 
 #: Added to distances, so that rounding does not decide, m.
@@ -164,7 +165,7 @@ class _Packer:
         self._kinds.append(kind)
         self._sizes.append(size)
         self._corners.append(corners)
-        self._radii.append(_radius(kind, size, corners))
+        self._radii.append(shape_radius(kind, size, corners))
         self._bodies.append(body)
         self._poses.append(pose[:3])
 
@@ -326,11 +327,3 @@ def _kind(shape: Solid) -> tuple[int, Array, Array]:
     if isinstance(shape, Mesh):
         return HULL, np.array([shape.hull.radius, shape.hull.half, 0.0]), shape.hull.corners
     raise OpenArmError(Code.INVALID_ARGUMENT, f"shape {type(shape).__name__}; valid: box, cylinder, sphere, mesh")
-
-
-def _radius(kind: int, size: Array, corners: Array) -> float:
-    if kind == CYLINDER:
-        return float(np.hypot(size[0], size[1]))
-    if kind == HULL:
-        return float(np.linalg.norm(corners, axis=1).max())
-    return float(np.linalg.norm(size)) if kind == BOX else float(size[0])

@@ -17,6 +17,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.bodies import Bodies
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid, solid_from
@@ -141,16 +142,12 @@ class CollisionRobot:
         return tuple(links), tuple(solids)
 
     def _enabled(self, description: RobotDescription) -> Iterable[tuple[int, int]]:
-        """Pairs of shapes to check: what the SRDF allows to touch is left out; without an SRDF, neighbours are."""
-        allowed, body, moving = description.allowed_collisions, self.arm.body, set(self.moving)
+        """Pairs of shapes to check, of which at least one moves."""
+        bodies, moving = Bodies.of(description), set(self.moving)
         for i in self.moving:
-            a = self.links[i]
-            for j, b in enumerate(self.links):
-                if (j in moving and j <= i) or body[a] == body[b] or frozenset((a, b)) in allowed:
-                    continue
-                if not description.srdf and frozenset((body[a], body[b])) in self.arm.neighbours:
-                    continue
-                yield i, j
+            for j, link in enumerate(self.links):
+                if not (j in moving and j <= i) and bodies.checked(self.links[i], link):
+                    yield i, j
 
     def _pairs_to_check(
         self, description: RobotDescription

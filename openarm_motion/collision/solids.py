@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from openarm_common.collision.hulls import Hull
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Primitive
 from openarm_common.types import Array
-from openarm_motion.collision.hulls import Hull
 
 
 @dataclass(frozen=True, eq=False)

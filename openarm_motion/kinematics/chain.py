@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.bodies import Bodies
 from openarm_common.robot.description import Joint, RobotDescription
 from openarm_common.types import Array
 from openarm_motion.kinematics import chain_kernels as kernels
@@ -216,7 +217,6 @@ class ArmLinks:
         hand: The gripper, what carries it, and the tool link: what a held object may touch.
         fixed: Links of the robot that no joint moves.
         body: Link -> name of the first link of the rigid body that it belongs to.
-        neighbours: Pairs of rigid bodies that one joint connects.
     """
 
     moving: frozenset[str]
@@ -224,22 +224,16 @@ class ArmLinks:
     hand: frozenset[str]
     fixed: frozenset[str]
     body: Mapping[str, str]
-    neighbours: frozenset[frozenset[str]]
 
     @classmethod
     def of(cls, description: RobotDescription, kinematics: ArmKinematics) -> ArmLinks:
         """Sort the links of `description` for the arm of `kinematics`."""
         chains = {link: [j for j in description.chain(link) if j.type != "fixed"] for link in description.links}
-        body = {link: joints[-1].child if joints else description.root for link, joints in chains.items()}
+        body = Bodies.of(description).body
         moving = {link for link, joints in chains.items() if any(j.name in kinematics.names for j in joints)}
         after = {link: _after(joints, kinematics.names[-1]) for link, joints in chains.items()}
         gripper = {link for link, joints in after.items() if joints}
         carriers = {joints[0].parent for joints in after.values() if joints}
-        neighbours = frozenset(
-            frozenset((body[joint.parent], body[joint.child]))
-            for joint in description.joints.values()
-            if joint.type != "fixed"
-        )
         # without a gripper the last rigid body is the hand
         hand = gripper | carriers or {link for link in moving if body[link] == body[kinematics.tool_link]}
         return cls(
@@ -248,7 +242,6 @@ class ArmLinks:
             hand=frozenset(hand | {kinematics.tool_link}),
             fixed=frozenset(link for link, joints in chains.items() if not joints),
             body=body,
-            neighbours=neighbours,
         )
 
 

@@ -19,7 +19,7 @@ from std_msgs.msg import Float64
 from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-from openarm_common.ros.node import reliable, run
+from openarm_common.ros.node import reliable, run, until_shutdown
 from openarm_common.scene.scene import load_scene
 from openarm_control.joints import JointReadout
 from openarm_control.ros.process import ControlNode, timely
@@ -32,7 +32,7 @@ from openarm_sim_bridge.ros.camera_publisher import topic_names
 from openarm_sim_bridge.ros.faces import Face, MotorFace, OpenArmRos2Face, SuiteFace
 from openarm_sim_bridge.ros.fault_server import FaultServer
 from openarm_sim_bridge.ros.simulation_server import SimulationServer
-from openarm_sim_bridge.ros.state_publisher import StatePublisher, until_shutdown
+from openarm_sim_bridge.ros.state_publisher import StatePublisher
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.world.stage import Stage
 from openarm_sim_bridge.world.world import Snapshot, World
@@ -89,7 +89,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
         self._face.serve(self._simulation)
-        self._sim_services = SimulationServer(self, stage, scene, self._simulation)
+        self._sim_services = SimulationServer(self, stage, scene, self._simulation, stays=not self._face.speaks)
 
         self._faults = FaultServer(
             self, self._simulation, cameras if self._images is not None else (), self._set_camera_faults

@@ -78,20 +78,18 @@ class SimulationServer:
         stage: Makes worlds.
         scene: The scene that is simulated.
         simulation: Whose world it is.
+        stays: The robot stays where it is when the world is reset: its joints are those of motors that hold it.
     """
 
     def __init__(
-        self,
-        node: BaseNode[Any],
-        stage: Stage,
-        scene: Scene,
-        simulation: Simulation,
+        self, node: BaseNode[Any], stage: Stage, scene: Scene, simulation: Simulation, *, stays: bool = False
     ) -> None:
         self._node = node
         self._stage = stage
         self._limits = limits_of(*arm_groups(node.description).values(), *gripper_groups(node.description).values())
         self._loaded = self._present = scene
         self._simulation = simulation
+        self._stays = stays
         self._changing = threading.Lock()
         serve(node, StepSimulation, "/sim/step", self._step)
         for kind, name, work in (
@@ -111,10 +109,15 @@ class SimulationServer:
             scene = load_scene(request.scene, request.seed) if request.scene else self._loaded
             joints, objects = self._start_of(request, scene)
             world = self._simulation.world
-            if scene == self._present:
-                change = partial(world.reset, joints, objects)
-            else:
-                change = partial(world.exchange, self._stage.compile(world, scene), joints, objects)
+            compiled = None if scene == self._present else self._stage.compile(world, scene)
+
+            def change() -> None:
+                start = world.posture() if self._stays and not joints else joints
+                if compiled is None:
+                    world.reset(start, objects)
+                else:
+                    world.exchange(compiled, start, objects)
+
             between_ticks(self._simulation, lambda: self._simulation.restart(change))
             self._loaded = self._present = scene
         return f"scene {scene.name!r} with {len(scene.objects)} objects"

@@ -6,12 +6,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 from openarm_interfaces.msg import ObjectState, ObjectStateArray
-from rclpy.context import Context
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
@@ -24,16 +21,6 @@ from openarm_control.ros.robot_publisher import RobotPublisher
 from openarm_sim_bridge.world.world import ObjectReadout, World
 
 WORLD_FRAME = "world"
-
-
-@contextmanager
-def until_shutdown(context: Context) -> Iterator[None]:
-    """Let publishing in a thread fail when a signal has shut the context down in the meantime."""
-    try:
-        yield
-    except rclpy_implementation.RCLError:
-        if context.ok():
-            raise
 
 
 class StatePublisher:

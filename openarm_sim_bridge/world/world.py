@@ -246,6 +246,10 @@ class World:
         return Snapshot(self.model, self.t_ns, self.data.qpos.copy())
 
     # --- reset and exchange
+    def posture(self) -> dict[str, float]:
+        """Return where the joints are, as `reset` takes it."""
+        return dict(zip(self.joint_names, self.data.qpos[self._compiled.qpos].tolist(), strict=True))
+
     def reset(self, joints: Mapping[str, float] | None = None, objects: Mapping[str, Array] | None = None) -> None:
         """Put robot and objects back to their start, at rest; simulated time continues.
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from openarm_common.collision.self_collision import SelfCollision
 from openarm_common.errors import OpenArmError
 from openarm_common.motors.bus import emulated_buses
 from openarm_common.motors.wiring import axes_of, load_wiring
@@ -26,6 +27,7 @@ from openarm_hardware.driver import MotorDriver
 from openarm_hardware.exchange import MotorState, State
 from openarm_hardware.loop import MotorRobot
 from openarm_hardware.posture import LastPosture
+from openarm_hardware.touch import KEEP, TouchGuard
 
 #: Robots whose folder says where their motors are.
 WIRED = [name for name in robot_names() if (models_dir() / "robots" / name / "hardware.yaml").is_file()]
@@ -55,8 +57,8 @@ class Servo:
     def command(self, joints: list[tuple[float, float]]) -> None:
         self.commands.append(joints)
 
-    def stop(self) -> None:
-        self.told.append("stop")
+    def stop(self, why: str = "") -> None:
+        self.told.append(f"stop {why}".strip())
 
     def reset(self) -> None:
         self.told.append("reset")
@@ -80,7 +82,8 @@ class Bench:
         )
         self.servo: Any = Servo(description)
         self.published: list[JointReadout] = []
-        self.driver = MotorDriver(self.servo, self.controller, self.loads, self.published.append)
+        guard = TouchGuard(SelfCollision(description, names))
+        self.driver = MotorDriver(self.servo, self.controller, self.loads, guard, self.published.append)
         self.robot = MotorRobot(self.controller, self.driver, 5.0, lambda _: None)
         self.kp = np.array([axis.kp for axis in self.servo.axes])
         self.arms = self.kp > 0.0
@@ -144,6 +147,42 @@ def test_a_step_of_the_controllers_is_spread_over_commands(bench: Bench) -> None
         bench.driver.send(bench.servo.q + np.where(bench.arms, 0.35, 0.0))
     total = np.array(bench.servo.commands[-1])[:, 0] - np.array(bench.servo.commands[0])[:, 0]
     assert total[bench.arms] == pytest.approx(0.35)
+
+
+@pytest.mark.requirement("R-08")
+def test_a_command_that_would_let_the_arms_touch_stops_them_and_names_the_links(bench: Bench) -> None:
+    robot, names, servo = bench.description, bench.controller.joint_names, bench.servo
+    checks = SelfCollision(robot, names)
+    apart = {n: q for arm in robot.arm_names for n, q in robot.group_state(f"{arm}_arm", "home").items()}
+    servo.q = np.array([apart.get(name, 0.0) for name in names])
+
+    def here() -> None:
+        bench.driver.take()
+        bench.controller.reset(bench.published[-1])
+
+    here()
+    bench.driver.send(servo.q)
+    assert not servo.told
+    low, high = robot.limits(names)
+    touching = next(
+        q
+        for q in np.random.default_rng(0).uniform(low, high, (200, len(names)))
+        if checks.nearest(checks.distances(q)).distance < -0.01
+    )
+    lengths = [checks.nearest(checks.distances(servo.q + x * (touching - servo.q))) for x in np.linspace(0, 1, 400)]
+    nearest = next(n for n in lengths if n.distance < KEEP - 0.0005)
+    start = servo.q.copy()
+    for share in np.linspace(0.0, 1.0, 400):  # arms that follow at once
+        servo.q = start + share * (touching - start)
+        here()
+        bench.driver.send(servo.q)
+        if servo.told:
+            break
+    (told,) = servo.told
+    assert {nearest.first, nearest.second} <= set(told.split())
+    commands = len(servo.commands)
+    bench.driver.send(servo.q)
+    assert len(servo.commands) == commands, "nothing is commanded any more"
 
 
 def test_arms_that_do_not_follow_are_told_to_stay(bench: Bench) -> None:

@@ -10,9 +10,9 @@ import pytest
 from scipy import ndimage
 
 from openarm_common import se3
+from openarm_common.collision import shape_kernels as kernels
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_motion.collision import shape_kernels as kernels
 from openarm_motion.collision.exact import CollisionContext, CollisionScene
 from openarm_motion.collision.fast import DistanceMap, FastScene, cover
 from openarm_motion.collision.robot import CollisionRobot

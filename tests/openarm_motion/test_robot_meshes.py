@@ -14,14 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common import se3
+from openarm_common.collision.hull_kernels import hull_separation
+from openarm_common.collision.hulls import Hull, directions
+from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE
 from openarm_common.robot.convex import convex_parts, hull_of
 from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
 from openarm_motion.collision.fast import FastScene
-from openarm_motion.collision.hull_kernels import hull_separation
-from openarm_motion.collision.hulls import Hull, directions
 from openarm_motion.collision.robot import CollisionRobot
-from openarm_motion.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE
 from openarm_motion.collision.solids import Mesh, box_from
 from openarm_motion.kinematics.chain import ArmKinematics
 

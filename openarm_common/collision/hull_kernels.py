@@ -11,8 +11,8 @@ import math
 
 from numba import njit
 
+from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL
 from openarm_common.types import Array, Ints
-from openarm_motion.collision.shape_kernels import BOX, CYLINDER, HULL
 
 #: Steps at most; shapes that touch take the most.
 _STEPS = 40
