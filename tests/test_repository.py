@@ -60,7 +60,14 @@ def test_sources_parameters_descriptions_messages_and_graphs_are_all_here() -> N
     assert len(PACKAGES) >= 7
     for package in PACKAGES:
         assert (ROOT / package / "package.xml").is_file(), package
-    assert {"openarm_interfaces", "tf2_msgs", "control_msgs", "vision_msgs", "octomap_msgs", "moveit_msgs"} <= FROM_INTERFACES
+    assert {
+        "openarm_interfaces",
+        "tf2_msgs",
+        "control_msgs",
+        "vision_msgs",
+        "octomap_msgs",
+        "moveit_msgs",
+    } <= FROM_INTERFACES
     for pattern in ("models/robots/*/*.xacro", "models/scenes/*.yaml", "config/params/*.yaml", "config/graphs/*.yaml"):
         assert list(ROOT.glob(pattern)), pattern
 

@@ -14,3 +14,4 @@ lock requirements.lock pyproject.toml --extra test --group setup "$@"
 lock requirements-build.lock --group interfaces "$@"
 lock requirements-dev.lock --group dev --constraints requirements.lock "$@"
 echo foxglove-sdk | lock requirements-viz.lock --constraints requirements.lock "$@" -
+printf 'pyrealsense2\nlibusb-package\n' | lock requirements-realsense.lock --constraints requirements.lock "$@" -

@@ -30,12 +30,13 @@ def up(
     discovery: Discovery | None = None,
     viz: bool = False,
     viz_port: int = 8765,
+    emulate: bool = False,
     robot: Robot = None,
 ) -> Outcome:
     """Start the nodes of a graph, and stop them at Ctrl-C (a second Ctrl-C: emergency stop, and hurry).
 
     Args:
-        graph: Name of a graph (sim, sim_only, perception, motion) or a file.
+        graph: Name of a graph (sim, sim_only, perception, motion, real) or a file.
         scene: Name or path of a scene, or "random".
         seed: Seed of a random scene.
         mount_seed: Seed of the true camera mounts, or "none" for the nominal ones.
@@ -43,6 +44,7 @@ def up(
         discovery: Reach of discovery; localhost when the graph says nothing else.
         viz: Offer every topic and service to Foxglove, at an address that is printed.
         viz_port: TCP port for that.
+        emulate: Of the graph real: the simulated robot in place of motors and cameras, frame by frame.
     """
     choose_robot(robot)
     import asyncio
@@ -54,7 +56,8 @@ def up(
 
     overrides = {"scene": scene, "seed": seed, "mount_seed": mount_seed, "domain": domain, "discovery": discovery}
     of_viz = tuple(item for item in set_ if viz and item.startswith(f"{NODE}."))
-    loaded = load_graph(graph, overrides=overrides, sets=[item for item in set_ if item not in of_viz])
+    sets = [item for item in set_ if item not in of_viz]
+    loaded = load_graph(graph, overrides=overrides, sets=sets, emulate=emulate)
     load_scene(loaded.scene, loaded.seed)  # a scene that does not fit is refused before anything starts
     address = ""
     if viz:

@@ -2,7 +2,8 @@
 """The node graph as data: a YAML file becomes a validated, frozen model.
 
 A graph names its nodes, what each needs before it starts, when it counts as ready, and its parameters. A file can
-extend another one and keep only some of its nodes. `${scene}`, `${seed}` and `${mount_seed}` in parameters are
+extend another one and keep only some of its nodes; what it says in `emulate` puts a simulated robot in place of a real
+one. `${scene}`, `${seed}` and `${mount_seed}` in parameters are
 replaced by the graph's own top-level values, `${arm}`, `${camera}` and `${hand_camera}` as in `supervision.parts`.
 """
 
@@ -204,13 +205,16 @@ def find_graph(name: str) -> Path:
     )
 
 
-def load_graph(name: str, *, overrides: Mapping[str, Any] | None = None, sets: Sequence[str] = ()) -> Graph:
+def load_graph(
+    name: str, *, overrides: Mapping[str, Any] | None = None, sets: Sequence[str] = (), emulate: bool = False
+) -> Graph:
     """Read a graph, apply overrides, substitute variables, and check it as a whole.
 
     Args:
         name: Name of a graph of the suite, or path of a file.
         overrides: Top-level values (scene, seed, mount_seed, domain, discovery); None leaves the file's value.
         sets: `node.param=value`, the value as YAML.
+        emulate: With what the file says in `emulate`.
 
     Raises:
         OpenArmError: CONFIG_INVALID for a fault in a file (named as file:key); INVALID_ARGUMENT for one in `sets`,
@@ -218,6 +222,9 @@ def load_graph(name: str, *, overrides: Mapping[str, Any] | None = None, sets: S
     """
     path = find_graph(name)
     data = _read(path, ())
+    stand_in = data.pop("emulate", None)
+    if emulate:
+        data = _emulated(data, stand_in, path)
     given = {key: value for key, value in (overrides or {}).items() if value is not None}
     data.update(given)
     where = f"{path} with {given}" if given else str(path)
@@ -265,6 +272,22 @@ def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
     elif only is not None:
         raise OpenArmError(Code.CONFIG_INVALID, f"{path}:only: needs `extends`")
     return graph
+
+
+def _emulated(graph: Mapping[str, Any], stand_in: Any, path: Path) -> dict[str, Any]:
+    """Return a graph with its emulation: nodes taken out, parameters set, nodes and top-level values added."""
+    if not isinstance(stand_in, dict):
+        text = f"{path} has no `emulate`, which says what stands for the robot; a graph that has is real"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
+    values: dict[str, Any] = dict(stand_in)  # pyright: ignore[reportUnknownArgumentType]
+    own, without = values.pop("nodes", None) or {}, values.pop("without", [])
+    _require_mappings(own, path)
+    nodes = {node: spec for node, spec in graph["nodes"].items() if node not in without}
+    for node, spec in own.items():
+        known = nodes.get(node, {})
+        params = {**(known.get("params") or {}), **(spec.get("params") or {})}
+        nodes[node] = {**known, **spec, "params": params}
+    return {**graph, **values, "nodes": nodes}
 
 
 def _require_mappings(nodes: Any, path: Path) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from cyclopts import Parameter, Token
 from cyclopts.validators import Number
@@ -68,6 +68,7 @@ class CampaignOptions:
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
         profile: Motors of the arms: openarm as owners have them, or ideal.
+        hardware: simulated, or emulated: openarm_hardware before motors that take frames, through the graph alone.
         dynamics_seeds: Motors, masses and joint zeros to go through with the profile openarm, such as 1-10.
         controllers: Of the robot: suite, or openarm_ros2 with the profile openarm, through the graph alone.
         identify: Whether the servos of each draw are identified first.
@@ -87,6 +88,7 @@ class CampaignOptions:
     mount_seeds: Seeds = ()
     profile: Profile = "openarm"
     controllers: FaceName = "suite"
+    hardware: Literal["simulated", "emulated"] = "simulated"
     dynamics_seeds: Seeds = (1,)
     identify: Annotated[bool, Parameter(negative="--no-identify")] = True
     use_effort: Annotated[bool, Parameter(name="--effort", negative="--no-effort")] = True
@@ -110,6 +112,11 @@ class CampaignOptions:
         parameters = tuple(item for item in self.parameters if item not in suites)
         object.__setattr__(self, "set_name", suites[0] if suites else self.set_name)
         object.__setattr__(self, "parameters", parameters)
+
+    @property
+    def emulated(self) -> bool:
+        """Whether the robot is met by the frames of its motors."""
+        return self.hardware == "emulated"
 
     @property
     def finder(self) -> DetectorKind:
@@ -138,6 +145,7 @@ class CampaignOptions:
         if self.profile == "ideal":
             return {}
         face = {"controllers": self.controllers} if self.controllers != "suite" else {}
+        face |= {"hardware": self.hardware} if self.emulated else {}
         seeds = list(self.dynamics_seeds)
         return {"profile": self.profile, **face, "dynamics_seeds": seeds, "identify": self.identify}
 
@@ -166,6 +174,7 @@ class CampaignOptions:
         else:
             parts.append("--dynamics-seeds " + ",".join(map(str, self.dynamics_seeds)))
             parts.append("" if self.controllers == "suite" else f"--controllers {self.controllers}")
+            parts.append("--hardware emulated" if self.emulated else "")
             parts.append("" if self.identify else "--no-identify")
         parts.append("" if self.use_effort else "--no-effort")
         parts.append(f"--objects {shlex.quote(self.objects)}" if self.objects else "")

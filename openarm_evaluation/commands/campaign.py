@@ -47,8 +47,9 @@ def campaign(
 
     if detectors and against is not None:
         raise OpenArmError(Code.INVALID_ARGUMENT, "--against compares one campaign with another; leave --detectors out")
-    if options.controllers != "suite" and not (graph and options.profile == "openarm"):
-        text = f"--controllers {options.controllers} needs --graph and the profile openarm"
+    if (options.controllers != "suite" or options.emulated) and not (graph and options.profile == "openarm"):
+        asked = "--hardware emulated" if options.emulated else f"--controllers {options.controllers}"
+        text = f"{asked} needs --graph and the profile openarm"
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}: it is of the robot as owners have it, over DDS")
     folder = (out or runs.new_run_dir()).resolve()
     others = rows_of(against) if against is not None else []

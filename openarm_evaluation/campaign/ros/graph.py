@@ -17,6 +17,7 @@ from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 from openarm_evaluation.campaign.dynamics import with_servos
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.record import write_reason
@@ -65,8 +66,9 @@ async def _run(options: CampaignOptions, seeds: Sequence[int], folder: Path, kee
     overrides: dict[str, Any] = {"domain": reserve_domain(), "scene": "random", "seed": seeds[0]}
     if options.mount_seeds:
         overrides["mount_seed"] = options.mount_seeds[0]
-    name = "sim" if options.controllers == "suite" else "openarm_ros2_sim"
-    graph = load_graph(name, overrides=overrides, sets=(*options.graph_parameters(), *_robot(options, folder)))
+    name = "real" if options.emulated else "sim" if options.controllers == "suite" else "openarm_ros2_sim"
+    sets = (*options.graph_parameters(), *_robot(options, folder))
+    graph = load_graph(name, overrides=overrides, sets=sets, emulate=options.emulated)
     for name in ("logs", "params", "scenes"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     async with running_graph(graph, folder) as supervisor:
@@ -78,6 +80,8 @@ async def _run(options: CampaignOptions, seeds: Sequence[int], folder: Path, kee
 
             def work() -> None:
                 for seed in seeds:
+                    if options.emulated:
+                        bring_home(client)
                     row = _row(observer, client, make_task(options.set_name, seed, options.objects), folder / "scenes")
                     row = {**row, "again": f"{options.command(seed)} --graph"}
                     if not row["as_expected"]:
@@ -96,9 +100,27 @@ def _robot(options: CampaignOptions, folder: Path) -> tuple[str, ...]:
     seed = task.dynamics_seed
     known = (servos / str(seed)).absolute()
     carrying = (f"mujoco_bridge.calibrations={known}",)
-    if options.controllers != "suite":
+    if options.emulated:
+        carrying = (f"openarm_hardware.calibrations={known}", f"openarm_hardware.dynamics_seed={seed}")
+    elif options.controllers != "suite":
         carrying = (f"arm_control.calibrations={known}", f"arm_control.dynamics_seed={seed}")
     return (f"mujoco_bridge.openarm.dynamics_seed={seed}", f"mujoco_bridge.openarm.zero_seed={seed}", *carrying)
+
+
+def bring_home(client: GraspClient) -> None:
+    """Bring arms to where a scene is put before them: those of motors stay where they are when the world is reset.
+
+    Raises:
+        OpenArmError: What keeps an arm from getting there.
+    """
+    from openarm_bringup.ros.stop_client import release
+    from openarm_motion.ros.client import MotionClient
+
+    release(client)
+    with MotionClient() as motion:
+        for arm in RobotDescription.load().arm_names:
+            client.release(arm)
+            motion.move_to_named(arm, "home", hand_empty=True).raise_for_code()
 
 
 def keep_recording(client: GraspClient, row: Row, folder: Path, timeout: float = _WRITTEN_S) -> None:

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A RealSense before the library's software device: pictures, alignment, units, IMU, what is refused."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_hardware.cameras.config import RealsenseConfig
+from openarm_hardware.cameras.realsense import RealSense, library
+from openarm_hardware.cameras.source import Shot
+from tests.openarm_hardware.realsense_device import COLOR_F, HEIGHT, RATE, WIDTH, SoftwareRealSense
+
+try:
+    library()
+except OpenArmError as error:
+    pytest.skip(error.message, allow_module_level=True)
+
+pytestmark = pytest.mark.requirement("R-09")
+COLOR = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+
+
+def config(**values: object) -> RealsenseConfig:
+    return RealsenseConfig.model_validate({"width": WIDTH, "height": HEIGHT, "rate": RATE, **values})
+
+
+def camera_of(device: SoftwareRealSense, **values: object) -> RealSense:
+    return RealSense(config(**values), lambda: [device.device])
+
+
+def seen(camera: RealSense, show: Callable[[], None]) -> Shot:
+    """The first picture of what is shown."""
+    end = time.monotonic() + 10.0
+    while time.monotonic() < end:
+        show()
+        if (shot := camera.read(0.2)) is not None:
+            return shot
+    raise AssertionError("no picture")
+
+
+def test_colour_depth_and_stamp_are_those_of_the_frames() -> None:
+    device = SoftwareRealSense()
+    camera = camera_of(device, serial="123456")
+    assert "Software D435I 123456" in camera.open()
+    depth = np.full((HEIGHT, WIDTH), 730, np.uint16)
+    stamps = itertools.count(1_700_000_000_123_000_000, 33_000_000)
+    shot = seen(camera, lambda: device.show(COLOR, depth, next(stamps)))
+    np.testing.assert_array_equal(shot.color, COLOR)
+    assert (shot.t_ns - 1_700_000_000_123_000_000) % 33_000_000 < 1_000
+    assert (camera.intrinsics.fx, camera.intrinsics.width) == (COLOR_F, WIDTH)
+    assert shot.depth is not None
+    assert shot.depth[HEIGHT // 2, WIDTH // 2] == 730
+    camera.close()
+
+
+def test_depth_is_aligned_to_colour() -> None:
+    device = SoftwareRealSense()
+    camera = camera_of(device)
+    camera.open()
+    depth = np.full((HEIGHT, WIDTH), 500, np.uint16)
+    depth[:, WIDTH // 2 + 8 :] = 900  # 8 pixels right of the middle by depth: 6 by colour
+    shot = seen(camera, lambda: device.show(COLOR, depth))
+    assert shot.depth is not None
+    row = shot.depth[HEIGHT // 2]
+    step = int(np.flatnonzero(row == 900)[0])
+    assert step == pytest.approx(WIDTH / 2 + 6, abs=1)
+    assert row[0] == 0, "the depth camera does not see so far to the left"
+    camera.close()
+
+
+def test_depth_in_other_units_is_in_millimetres() -> None:
+    device = SoftwareRealSense(unit=0.0001)
+    camera = camera_of(device)
+    camera.open()
+    shot = seen(camera, lambda: device.show(COLOR, np.full((HEIGHT, WIDTH), 7304, np.uint16)))
+    assert shot.depth is not None
+    assert shot.depth[HEIGHT // 2, WIDTH // 2] == 730
+    camera.close()
+
+
+def test_distortion_is_taken_out() -> None:
+    device = SoftwareRealSense(coefficients=(0.3, 0.0, 0.0, 0.0, 0.0))
+    camera = camera_of(device)
+    camera.open()
+    ramp = np.repeat(np.arange(WIDTH, dtype=np.uint8)[None, :, None] * 3, HEIGHT, axis=0).repeat(3, axis=2)
+    shot = seen(camera, lambda: device.show(ramp, np.full((HEIGHT, WIDTH), 500, np.uint16)))
+    x = (np.arange(WIDTH) - (WIDTH - 1) / 2) / COLOR_F
+    row = HEIGHT // 2
+    for column in (10, 32, 50):  # what is seen at u lies at x (1 + k r²)
+        value = shot.color[row, column, 0] / 3.0
+        found = (value - (WIDTH - 1) / 2) / COLOR_F
+        assert found * (1.0 + 0.3 * found**2) == pytest.approx(x[column], abs=0.01)
+    assert abs(int(shot.color[row, 10, 0]) - int(ramp[row, 10, 0])) > 1
+    camera.close()
+
+
+def test_the_imu_is_read_with_the_pictures() -> None:
+    device = SoftwareRealSense()
+    camera = camera_of(device)
+    camera.open()
+    turns = []
+    depth = np.full((HEIGHT, WIDTH), 500, np.uint16)
+
+    def show() -> None:
+        device.turn((0.1, 0.2, 0.3), (0.0, -9.8, 0.1))
+        device.show(COLOR, depth)
+
+    end = time.monotonic() + 10.0
+    while not turns and time.monotonic() < end:
+        turns += seen(camera, show).turns
+    np.testing.assert_allclose(turns[0].gyro, (0.1, 0.2, 0.3), atol=1e-6)
+    np.testing.assert_allclose(turns[0].acceleration, (0.0, -9.8, 0.1), atol=1e-6)
+    camera.close()
+
+
+@pytest.mark.parametrize(
+    ("values", "code", "text"),
+    [
+        ({"serial": "999"}, Code.NOT_READY, "999.*there are: Software D435I 123456"),
+        ({"width": 640, "height": 480}, Code.CONFIG_INVALID, f"it gives {WIDTH}x{HEIGHT} at {RATE} Hz"),
+    ],
+)
+def test_what_is_not_there_is_refused_with_what_is(values: dict[str, object], code: Code, text: str) -> None:
+    device = SoftwareRealSense()
+    with pytest.raises(OpenArmError, match=text) as refused:
+        camera_of(device, **values).open()
+    assert refused.value.code is code
+
+
+def test_without_a_camera_it_says_so() -> None:
+    with pytest.raises(OpenArmError, match="no RealSense is plugged in"):
+        RealSense(config(), list).open()
