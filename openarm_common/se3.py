@@ -9,6 +9,8 @@ them.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -80,6 +82,15 @@ def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
         yaw: About z, rad.
     """
     return rot_z(yaw) @ rot_y(pitch) @ rot_x(roll)
+
+
+def rpy_from_matrix(R: Array) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw of a rotation (3, 3), see `matrix_from_rpy`; with the pitch upright, the yaw is 0."""
+    level = math.hypot(R[0, 0], R[1, 0])
+    pitch = math.atan2(-R[2, 0], level)
+    if level < 1e-9:
+        return math.atan2(-R[1, 2], R[1, 1]), pitch, 0.0
+    return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])
 
 
 def rotation_from_z_y(z: ArrayLike, y: ArrayLike) -> Array:

@@ -22,13 +22,14 @@ import yaml
 
 from openarm_common.domain import release_domain, reserve_domain
 from openarm_common.resources import models_dir
-from openarm_common.robot import folder
+from openarm_common.robot import folder, zeros
 
 # Before any rclpy is imported: a domain of this process, no traffic beyond this machine, software rendering.
 os.environ["ROS_DOMAIN_ID"] = str(reserve_domain())
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.pop(folder.ROBOT, None)  # a test that is about another robot than the default one says so
+os.environ.pop(zeros.ZEROS, None)
 
 # A run of the suite draws the same examples every time and times none; `--hypothesis-profile=explore` draws new ones.
 hypothesis.settings.register_profile("suite", deadline=None, derandomize=True)

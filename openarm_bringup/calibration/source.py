@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from openarm_calibration.sampling.samples import SampleSet
     from openarm_calibration.store.store import CalibrationStore
     from openarm_calibration.store.table import TableStore
+    from openarm_common.robot.zero_store import ZeroStore
 
 
 @Parameter(name="*")
@@ -82,7 +83,7 @@ def with_solved(
         OpenArmError: What is wrong with the file or the options; DEGENERATE, when a session determines nothing.
     """
     from openarm_calibration.handeye.closed_form import REFINED
-    from openarm_calibration.handeye.offline import calibrate, checked_algorithm, without_named
+    from openarm_calibration.handeye.offline import calibrate, checked_algorithm
     from openarm_calibration.handeye.solve import SolveConfig
     from openarm_common.records import now
 
@@ -90,13 +91,7 @@ def with_solved(
     if free_intrinsics and name != REFINED:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--free-intrinsics: only {REFINED} finds intrinsics, not {name}")
     config = SolveConfig(extras=("intrinsics",)) if free_intrinsics else None
-    stills: list[dict[str, Any]] = []
-    text = ""
-    if path.is_dir() or path.suffix == ".mcap":
-        samples, digest, stills, text = _from_bag(path, source)
-    else:
-        samples, digest = _from_session(path, source)
-    without_named(samples, source.exclude)
+    samples, digest, stills, text = opened(path, source)
     stored = store_in(source.store).in_use(samples.head.camera, samples.head.mount_seed)
     try:
         result = calibrate(samples, algorithm=name, config=config, session=digest, created=now(), stored=stored)
@@ -105,6 +100,52 @@ def with_solved(
             raise
         return Outcome(False, error.message, error.code, {"stills": stills}, text)
     return then(Solved(samples, result, stills, text))
+
+
+def opened(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str, Any]], str]:
+    """Open a session file or a bag at the stored zeros of its robot's joints.
+
+    Args:
+        path: Session file (.npz), or a bag.
+        source: Options of the command line.
+
+    Returns:
+        Samples, their hash, what became of the images of a bag, and the same as text.
+
+    Raises:
+        OpenArmError: What is wrong with the file or the options.
+    """
+    from openarm_calibration.handeye.offline import without_named
+
+    if path.is_dir() or path.suffix == ".mcap":
+        samples, digest, stills, text = _from_bag(path, source)
+    else:
+        samples, digest = _from_session(path, source)
+        stills, text = [], ""
+    without_named(samples, source.exclude)
+    return at_stored_zeros(samples, source.store), digest, stills, text
+
+
+def at_stored_zeros(samples: SampleSet, store: Path | None) -> SampleSet:
+    """Return samples of a robot with the zeros of its joints that are stored; a foreign robot's stay as they are.
+
+    Args:
+        samples: Of a session.
+        store: Folder of stored calibrations.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when the stored zeros are damaged.
+    """
+    from openarm_common.records import OfAnotherRobot
+    from openarm_common.robot.zeros import REAL
+
+    of = samples.head.zeros_of
+    if samples.foreign or (of == REAL and samples.head.mount_seed is not None):  # simulated, by an older version
+        return samples
+    try:
+        return samples.with_zeros(zeros_in(store).in_use(of).record.offsets)
+    except OfAnotherRobot:
+        return samples
 
 
 def _from_session(path: Path, source: Source) -> tuple[SampleSet, str]:
@@ -159,6 +200,13 @@ def tables_in(folder: Path | None) -> TableStore:
     from openarm_calibration.store.table import TableStore
 
     return TableStore(store_in(folder).folder)
+
+
+def zeros_in(folder: Path | None) -> ZeroStore:
+    """Return the stored zeros of the joints in a folder; errors as `store_in`."""
+    from openarm_common.robot.zero_store import ZeroStore
+
+    return ZeroStore(store_in(folder).folder)
 
 
 def store_in(folder: Path | None) -> CalibrationStore:

@@ -12,14 +12,17 @@ from openarm_bringup.calibration.source import (
     ALL_SAMPLES,
     Solved,
     Source,
+    at_stored_zeros,
     given_board,
     store_in,
     tables_in,
     with_solved,
+    zeros_in,
 )
-from openarm_bringup.commands import calibrate_foreign, calibrate_live
+from openarm_bringup.commands import calibrate_foreign, calibrate_live, calibrate_zeros
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.zeros import REAL
 
 if TYPE_CHECKING:
     from openarm_calibration.store.store import CalibrationStore, StoredCalibration
@@ -31,6 +34,7 @@ calibrate.command(calibrate_live.auto)
 calibrate.command(calibrate_live.sample)
 calibrate.command(calibrate_live.table)
 calibrate.command(calibrate_live.dynamics)
+calibrate.command(calibrate_zeros.zeros)
 calibrate.command(calibrate_foreign.import_, name="import")
 calibrate.command(calibrate_foreign.export)
 
@@ -117,7 +121,8 @@ def together(*sessions: Path, save: bool = False, store: Path | None = None) -> 
     if len(sessions) < 2:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{len(sessions)} sessions given, expected two or more; one: `solve`")
     place = store_in(store)
-    opened = [load_session(session, RobotDescription.load()) for session in sessions]
+    read = [load_session(session, RobotDescription.load()) for session in sessions]
+    opened = [(at_stored_zeros(samples, store), digest) for samples, digest in read]
     results = calibrate_together(
         [samples for samples, _ in opened],
         hashes=[digest for _, digest in opened],
@@ -163,7 +168,7 @@ def report(samples: Path, out: Path, *, source: Source = ALL_SAMPLES) -> Outcome
 
 @calibrate.command(name="list")
 def list_(*, store: Path | None = None) -> Outcome:
-    """Name the stored calibrations and the measured table, with their history.
+    """Name the stored calibrations, zeros of joints and the measured table, with their history.
 
     Args:
         store: Folder of stored calibrations.
@@ -190,6 +195,14 @@ def list_(*, store: Path | None = None) -> Outcome:
             lines.append(f"table: {_height(kept)}  ({len(tables.history(TABLE))} in its history)")
         except OpenArmError as error:
             faults.append(error.message)
+    known = zeros_in(store)
+    for of in known.names():
+        try:
+            found = known.load(of)
+            data.setdefault("zeros", {})[of] = found.model_dump(mode="json")
+            lines.append(f"{calibrate_zeros.line(found)}  ({len(known.history(of))} in its history)")
+        except OpenArmError as error:
+            faults.append(error.message)
     if faults:
         return Outcome(False, "; ".join(faults), Code.CONFIG_INVALID, data, "\n".join(lines))
     return Outcome(True, f"{len(lines)} stored in {opened.folder}", data=data, text="\n".join(lines))
@@ -197,13 +210,16 @@ def list_(*, store: Path | None = None) -> Outcome:
 
 @calibrate.command
 def rollback(camera: str, *, store: Path | None = None) -> Outcome:
-    """Go back to the calibration of a camera, or the height of the table, before the present one.
+    """Go back to the calibration of a camera, the table's height, or the zeros of the joints before the present one.
 
     Args:
-        camera: Its name; or "table".
+        camera: Its name; or "table"; or "zeros" (of a simulated robot as `list` names them), with the mounts then.
         store: Folder of stored calibrations.
     """
     from openarm_calibration.store.table import TABLE
+
+    if camera == REAL or camera in zeros_in(store).names():
+        return calibrate_zeros.rolled_back(camera, store)
 
     if camera == TABLE:
         height = tables_in(store).rollback(TABLE)

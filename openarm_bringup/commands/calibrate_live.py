@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from openarm_bringup.calibration.source import store_in
+from openarm_bringup.calibration.source import at_stored_zeros, store_in
 from openarm_bringup.commands.connect import Domain, Robot, Sets, join_graph, requires_node
 from openarm_bringup.outcome import GraphReport, Outcome
 from openarm_common.errors import Code, OpenArmError
@@ -76,7 +76,7 @@ def auto(
         return _running(options, show)
     run = run_calibration(options, CalibrationListeners(show.event, show.ready, show.camera, show.feedback))
     for name in run.results:
-        _page(run.run_dir / f"{name}.npz", run.run_dir / f"{name}.html")
+        _page(run.run_dir / f"{name}.npz", run.run_dir / f"{name}.html", store)
     return _outcome(run.results, run.error, run.run_dir)
 
 
@@ -271,7 +271,7 @@ def _outcome(results: dict[str, AutoCalibrate.Result], error: OpenArmError | Non
     return Outcome(True, f"calibrated {', '.join(results)}{where}", data=data, text=text)
 
 
-def _page(session: Path, out: Path) -> None:
+def _page(session: Path, out: Path, store: Path | None) -> None:
     """Write the page of a session, when there is one that can be solved."""
     from openarm_calibration.handeye.offline import calibrate
     from openarm_calibration.report.report import page
@@ -281,6 +281,7 @@ def _page(session: Path, out: Path) -> None:
     if not session.is_file():
         return
     samples, digest = load_session(session, RobotDescription.load())
+    samples = at_stored_zeros(samples, store)
     try:
         result = calibrate(samples, session=digest)
     except OpenArmError as error:

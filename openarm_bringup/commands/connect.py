@@ -9,12 +9,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.folder import ROBOT, known_arm
+from openarm_common.robot.zeros import ZEROS
 
 if TYPE_CHECKING:
     from openarm_bringup.ros.peer import Peer
@@ -64,6 +66,8 @@ def join_graph(domain: int | None) -> None:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         return
     os.environ.update({**discovery.variables(record.domain, record.discovery), ROBOT: record.robot})
+    for kept in sorted((Path(record.run_dir) / "zeros").glob("*.yaml")):
+        os.environ[ZEROS] = str(kept)
     if record.discovery in discovery.ACROSS_MACHINES:
         os.environ.setdefault(discovery.PROFILE, str(discovery.network_profile()))
 

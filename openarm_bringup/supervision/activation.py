@@ -85,7 +85,7 @@ class Activation:
 
     async def _keep(self, listener: socket.socket) -> None:
         supervisor, loop = self._supervisor, asyncio.get_running_loop()
-        env = environment.client_environment(supervisor.graph)
+        env = environment.client_environment(supervisor.graph, supervisor.run_dir)
         argv = [sys.executable, "-m", _MODULE, str(listener.fileno()), str(environment.domain_id(supervisor.graph))]
         log = supervisor.log_file("daemon")
         while True:

@@ -16,10 +16,15 @@ import yaml
 from openarm_bringup.supervision.discovery import ACROSS_MACHINES, LAST_DOMAIN, PROFILE, network_profile, variables
 from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.records import default_folder
 from openarm_common.resources import config_dir, write_whole
+from openarm_common.robot.zero_store import ZeroStore
+from openarm_common.robot.zeros import REAL, ZEROS, Zeros, keep_zeros
 
 #: Of one message through shared memory, MiB; a cloud of 640x480 points takes 3.7 MB.
 _LARGEST_MIB = 4
+#: The node that simulates a robot.
+_BRIDGE = "mujoco_bridge"
 
 
 def domain_id(graph: Graph, environ: Mapping[str, str] = os.environ) -> int:
@@ -41,9 +46,18 @@ def ros_environment(graph: Graph, environ: Mapping[str, str] = os.environ) -> di
     return variables(domain_id(graph, environ), graph.discovery)
 
 
-def client_environment(graph: Graph, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return the whole environment of a process that meets the graph."""
-    env = {**environ, **ros_environment(graph, environ), "PYTHONUNBUFFERED": "1"}
+def client_environment(graph: Graph, run_dir: Path, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Return the whole environment of a process that meets the graph; keeps the zeros of its robot in the run folder.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when the stored zeros of the joints are damaged.
+    """
+    env = {
+        **environ,
+        **ros_environment(graph, environ),
+        "PYTHONUNBUFFERED": "1",
+        ZEROS: str(zeros_file(graph, run_dir)),
+    }
     env.pop("ROS_LOCALHOST_ONLY", None)  # deprecated, and would override the discovery range
     env.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "[{severity}] {message}")
     if graph.discovery in ACROSS_MACHINES:
@@ -56,10 +70,36 @@ def client_environment(graph: Graph, environ: Mapping[str, str] = os.environ) ->
 
 def node_environment(graph: Graph, name: str, run_dir: Path, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Return the whole environment of one node; writes its Fast DDS profile when it has one."""
-    spec, env = graph.node(name), client_environment(graph, environ)
+    spec, env = graph.node(name), client_environment(graph, run_dir, environ)
     if spec.large_messages:
         env[PROFILE] = str(write_profile(spec, run_dir / "params" / f"{name}.fastdds.xml"))
     return {**env, **spec.env}
+
+
+def zeros_file(graph: Graph, run_dir: Path) -> Path:
+    """Return the file of the zeros of the joints in a run folder, copied from what is stored when a run begins."""
+    folder = run_dir / "zeros"
+    if kept := sorted(folder.glob("*.yaml")):
+        return kept[0]
+    publisher = graph.parameters("calibration_publisher") if "calibration_publisher" in graph.nodes else {}
+    given = str(publisher.get("store", ""))
+    store = ZeroStore(Path(given).expanduser() if given else default_folder())
+    record = store.in_use(zeros_name(graph)).record
+    return keep_zeros(Zeros(robot=record.robot, of=record.of, offsets=record.offsets), folder)
+
+
+def zeros_name(graph: Graph) -> str:
+    """Return what the zeros of the robot of a graph are stored as; a simulated one goes by what draws its zeros."""
+    return name_of_zeros(graph.parameters(_BRIDGE) if _BRIDGE in graph.nodes else None)
+
+
+def name_of_zeros(bridge: Mapping[str, object] | None) -> str:
+    """Return what zeros are stored as by the parameters of the bridge that simulates the robot; None: a real one."""
+    if bridge is None:
+        return REAL
+    profile = str(bridge.get("profile", "openarm"))
+    drawn = [f"{key}_{bridge[f'{profile}.{key}']}" for key in ("zero_seed", "zero_rms") if f"{profile}.{key}" in bridge]
+    return re.sub("[^a-z0-9_]", "_", "_".join(["simulated", profile, *drawn]).lower())[:64]
 
 
 def write_profile(spec: NodeSpec, path: Path) -> Path:

@@ -7,7 +7,6 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import yaml
-from scipy.spatial.transform import Rotation
 
 from openarm_calibration.foreign.optics import Lens, camera_info
 from openarm_calibration.store.store import StoredCalibration
@@ -82,7 +81,7 @@ def _static_transform(item: StoredCalibration, T: Array, child: str) -> str:
 def _urdf(item: StoredCalibration, T: Array, child: str) -> str:
     """Return a link and the fixed joint that carries it."""
     xyz = " ".join(f"{value:.9f}" for value in T[:3, 3].tolist())
-    rpy = " ".join(f"{value:.9f}" for value in Rotation.from_matrix(T[:3, :3]).as_euler("xyz").tolist())
+    rpy = " ".join(f"{value:.9f}" for value in se3.rpy_from_matrix(T[:3, :3]))
     return (
         f"<link name={quoteattr(child)}/>\n"
         f'<joint name={quoteattr(f"{item.camera}_mount")} type="fixed">\n'

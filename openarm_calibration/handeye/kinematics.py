@@ -48,11 +48,14 @@ class Kinematics:
         by = np.zeros((6, len(self.parameters)))
         p = T_tip[:3, 3]
         for moves, sign in ((moves_tip, 1.0), (moves_base, -1.0)):
-            for name, factor, axis, point, turns in moves:
-                if name not in index:
-                    continue
-                by[:3, index[name]] += sign * factor * (np.cross(axis, p - point) if turns else axis)
-                by[3:, index[name]] += sign * factor * axis * turns
+            known = [move for move in moves if move[0] in index]
+            if not known:
+                continue
+            names, factors, axes, points, turning = zip(*known, strict=True)
+            axis, turns = np.array(axes), np.array(turning)[:, None]
+            moved = np.concatenate([np.where(turns, np.cross(axis, p - np.array(points)), axis), axis * turns], axis=1)
+            columns = [index[name] for name in names]
+            np.add.at(by.T, columns, sign * np.array(factors)[:, None] * moved)
         by[:3] = T_base[:3, :3].T @ by[:3]
         by[3:] = T_tip[:3, :3].T @ by[3:]
         return se3.inverse(T_base) @ T_tip, by

@@ -28,6 +28,7 @@ from openarm_calibration.store.store import StoredCalibration
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.zeros import zeros_label
 
 #: Postures within this of each other have the same error of the robot, rad or m.
 _SAME_POSTURE = 1e-3
@@ -133,7 +134,7 @@ def judged(
         samples.head.camera, samples.head.parent, X @ se3.inverse(T_LINK_OPTICAL), intrinsics=problem.intrinsics[0],
         sigma_translation=sigma_t, sigma_rotation=sigma_r, mount_seed=samples.head.mount_seed, method=algorithm,
         board=samples.board.label, samples=int(np.count_nonzero(solution.used)), session=session, created=created,
-        versions=versions(),
+        zeros=zeros_label(samples.description.zeros), versions=versions(),
     )  # fmt: skip
     return Result(solution, verdict, side_by_side(problem, solution), calibration)
 

@@ -21,10 +21,9 @@ import numpy as np
 from pydantic import Field
 
 from openarm_calibration.handeye.kinematics import Kinematics, Posture
-from openarm_calibration.handeye.problem import View, assemble, layout
+from openarm_calibration.handeye.problem import Problem, View, assemble, layout
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.unknowns import Priors, Solution
-from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
@@ -32,6 +31,11 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.urdf import Joint
 from openarm_common.types import Array
 
+#: Deviations of the offsets that are compared, the widest first; the last one says that zeros are right, rad.
+_SCALES = tuple(math.radians(degrees) for degrees in (4.0, 2.0, 1.0, 0.5, 0.25, 0.1, 0.03, 0.001))
+#: Twice the logarithm of the likelihood ratio from which the zeros count as wrong: very strong evidence (Kass and
+#: Raftery 1995, "Bayes factors").
+_EVIDENT = 10.0
 #: Posterior over prior deviation up to which the data tell a joint; two joints that only differ by a mount have 0.71.
 _TOLD = 0.5
 
@@ -39,14 +43,18 @@ _TOLD = 0.5
 class ZerosConfig(Config):
     """What is known of the zeros beforehand, and what else is estimated."""
 
-    sigma: float = Field(default=math.radians(3.0), gt=0.0, description="of a joint's offset, rad")
+    sigma: float | None = Field(
+        default=None, gt=0.0, description="of a joint's offset, rad; None: the likeliest one, by all joints together"
+    )
     by_joint: dict[str, float] = Field(
         default_factory=dict, description="the same of single joints, rad; 0 takes the reported zero for true"
     )
     lengths: float | None = Field(default=None, gt=0.0, description="of links' lengths, m; None: as described")
     flexure: float | None = Field(default=None, gt=0.0, description="of joints' compliance, rad/(N m); None: stiff")
     solver: SolveConfig = Field(
-        default=SolveConfig(most_translation=10.0, most_rotation=10.0), description="of mounts and noise"
+        # a misfit would explain zeros that are off as well
+        default=SolveConfig(misfit=False, most_translation=10.0, most_rotation=10.0),
+        description="of mounts and noise",
     )
 
 
@@ -95,6 +103,11 @@ class ZerosResult:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     @property
+    def off(self) -> bool:
+        """Whether the samples show that zeros are off at all, where that was to be found out."""
+        return bool(self.prior.max(initial=0.0) > _SCALES[-1])
+
+    @property
     def told(self) -> tuple[bool, ...]:
         """Whether the data tell each parameter; where not, the prior decides."""
         return tuple(bool(s < _TOLD * p) for s, p in zip(self.sigma, self.prior, strict=True))
@@ -105,6 +118,8 @@ class ZerosResult:
 
     def sentences(self) -> tuple[str, ...]:
         """Return a line for each parameter, with whether the data tell it."""
+        if not self.off:
+            return ("the samples show no joint whose zero is off",)
         out: list[str] = []
         for name, value, sigma, prior, told in zip(
             self.names, self.values, self.sigma, self.prior, self.told, strict=True
@@ -150,7 +165,7 @@ def _parameters(
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"a prior for {name!r}, which moves nothing here; joints: {', '.join(joints)}"
             )
-    names, sigma = list(joints), [config.by_joint.get(name, config.sigma) for name in joints]
+    names, sigma = list(joints), [config.by_joint.get(name, config.sigma or _SCALES[0]) for name in joints]
     if config.lengths is not None:
         long = [name for name in joints if _has_length(description.joint(name))]
         names += [f"{name} length" for name in long]
@@ -165,11 +180,28 @@ def _has_length(joint: Joint) -> bool:
     return bool(np.linalg.norm(joint.T_parent_joint[:3, 3]) > 1e-6)
 
 
+def arm_problem(
+    description: RobotDescription, views: Sequence[ArmView], intrinsics: Sequence[Intrinsics], names: tuple[str, ...]
+) -> Problem:
+    """Return the problem of views whose robot poses follow from their joints by `Problem.posed`.
+
+    Args:
+        description: The robot.
+        views: At least one.
+        intrinsics: Of each camera.
+        names: Of the parameters, as in `ZerosResult`.
+    """
+    chains = {ends: Kinematics(description, *ends, names) for ends in {(view.base, view.tip) for view in views}}
+    armed = [replace(view.view, arm=Posture(chains[view.base, view.tip], view.q, view.torque)) for view in views]
+    return assemble(armed, intrinsics, [view.guess for view in views])
+
+
 def solve_zeros(
     description: RobotDescription,
     views: Sequence[ArmView],
     intrinsics: Sequence[Intrinsics],
     config: ZerosConfig | None = None,
+    start: Solution | None = None,
 ) -> ZerosResult:
     """Estimate the zeros of the joints with all mounts.
 
@@ -178,6 +210,7 @@ def solve_zeros(
         views: Of any number of sets: `View.camera` and `View.board` number the mounts, `View.pose` the robot poses.
         intrinsics: Of each camera.
         config: Priors.
+        start: A solution of nearly the same views, to start from.
 
     Raises:
         OpenArmError: DEGENERATE, when the views determine no mount; INVALID_ARGUMENT, for no view, or a prior of a
@@ -186,50 +219,21 @@ def solve_zeros(
     config = config or ZerosConfig()
     if not views:
         raise OpenArmError(Code.INVALID_ARGUMENT, "no views; take samples of at least one camera and board")
-    names, prior = _parameters(description, views, config)
-    chains = {ends: Kinematics(description, *ends, names) for ends in {(view.base, view.tip) for view in views}}
-    values = np.zeros(len(names))
-    armed = [replace(view.view, arm=Posture(chains[view.base, view.tip], view.q, view.torque)) for view in views]
-    problem = assemble(armed, intrinsics, [view.guess for view in views]).posed(np.zeros(len(names)))
+    names, _ = _parameters(description, views, config)
+    problem = arm_problem(description, views, intrinsics, names).posed(np.zeros(len(names)))
     solver = config.solver.model_copy(update={"extras": (*config.solver.extras, "zeros")})
-    priors = Priors(zeros=prior)
     # views that contradict the others may do so by the zeros alone, as long as these are not known
-    solution = solve(problem, solver.model_copy(update={"reject_outliers": False}), priors)
+    trusting = solver.model_copy(update={"reject_outliers": False})
+    answers: list[tuple[Array, Solution]] = []
+    for scale in _SCALES if config.sigma is None else (config.sigma,):
+        _, sigma = _parameters(description, views, config.model_copy(update={"sigma": scale}))
+        start = solve(problem, trusting, Priors(zeros=sigma), start=start)
+        answers.append((sigma, start))
+    prior, solution = min(answers, key=lambda answer: answer[1].estimate.evidence)
+    if not solution.estimate.evidence < answers[-1][1].estimate.evidence - _EVIDENT:
+        prior, solution = answers[-1]
     if solver.reject_outliers:
-        solution = solve(problem, solver, priors, start=solution)
-    estimate = solution.estimate
-    values, covariance = estimate.zeros, estimate.covariance()
+        solution = solve(problem, solver, Priors(zeros=prior), start=solution)
+    estimate, covariance = solution.estimate, solution.estimate.covariance()
     columns = layout(solution.problem, estimate.extras)["zeros"]
-    covariance = covariance[columns, columns]
-    return ZerosResult(names, values, covariance, prior, solution)
-
-
-def arm_views(sessions: Sequence[SampleSet]) -> tuple[tuple[ArmView, ...], tuple[Intrinsics, ...]]:
-    """Return the views of sessions, and the intrinsics of their cameras, as `solve_zeros` takes them.
-
-    Sessions of one camera on the same link share its mount; each session has a board of its own.
-
-    Args:
-        sessions: Of one robot, of any cameras and arms.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, for sessions of different robots, or of one camera with different intrinsics.
-    """
-    robots = sorted({samples.head.robot for samples in sessions if samples.head.robot})
-    if len(robots) > 1:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"sessions of {', '.join(robots)}; joints have the same zeros in one robot only"
-        )
-    mounts: dict[tuple[str, str], Intrinsics] = {}
-    out: list[ArmView] = []
-    for board, samples in enumerate(sessions):
-        place = samples.head.camera, samples.head.parent
-        if mounts.setdefault(place, samples.head.optics) != samples.head.optics:
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT, f"sessions of camera {place[0]!r} with different intrinsics; solve them apart"
-            )
-        chain = samples.kinematics(())
-        for sample, view in zip(samples.samples, samples.problem().views, strict=True):
-            numbered = replace(view, camera=list(mounts).index(place), board=board, pose=len(out))
-            out.append(ArmView(numbered, chain.base, chain.tip, sample.joints, sample.T_camera_board))
-    return tuple(out), tuple(mounts.values())
+    return ZerosResult(names, estimate.zeros, covariance[columns, columns], prior, solution)

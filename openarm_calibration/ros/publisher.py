@@ -29,6 +29,7 @@ from openarm_common.camera.cameras import T_LINK_OPTICAL, CameraConfig, Intrinsi
 from openarm_common.config import validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder, now
+from openarm_common.robot.zeros import zeros_label
 from openarm_common.ros.answers import answering
 from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform
 from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
@@ -140,6 +141,11 @@ class PublisherNode(BaseNode[PublisherConfig]):
         if found.warning:
             faults.append(found.warning)
         calibration = found.record
+        if calibration.zeros != zeros_label(self.description.zeros):
+            faults.append(
+                f"the calibration of {camera.name!r} was found with other zeros of the joints than those in use;"
+                " calibrate it again, or start the graph again where zeros were stored since"
+            )
         self._last[camera.name] = calibration.T_parent_link, calibration.intrinsics
         return self._last[camera.name], f"calibrated {calibration.digest()[:12]}"
 

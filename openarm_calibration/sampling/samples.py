@@ -38,6 +38,7 @@ from openarm_common.config import Config, validate
 from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.resources import write_whole
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.zeros import REAL, zeros_of
 from openarm_common.types import Array
 
 #: Half the step of the derivative of the robot's pose by time, s.
@@ -59,6 +60,7 @@ class SessionHead(Config):
     mount_seed: int | None = Field(default=None, description="of the simulated mounts")
     created: str = Field(default="", description="when, as ISO 8601")
     robot: str = Field(default="", description="name of the robot; empty in sessions of older versions")
+    zeros_of: str = Field(default=REAL, description="robot whose joint zeros count: zeros, or a simulated one's")
 
     @field_validator("intrinsics")
     @classmethod
@@ -140,7 +142,25 @@ class SampleSet:
 
     def copy(self) -> SampleSet:
         """Return a set with the same samples."""
-        out = SampleSet(self.head, self._description, foreign=self._foreign)
+        return self._of(self._description)
+
+    @property
+    def description(self) -> RobotDescription:
+        """The robot."""
+        return self._description
+
+    @property
+    def foreign(self) -> bool:
+        """Whether the robot is one that the session describes itself."""
+        return self._foreign
+
+    def with_zeros(self, offsets: Mapping[str, float]) -> SampleSet:
+        """Return the same samples of a robot with these zeros of its joints, instead of those that it has, rad."""
+        mine = {name: offset for name, offset in offsets.items() if name in self._description.joints}
+        return self._of(self._description.described.with_zeros(mine))
+
+    def _of(self, description: RobotDescription) -> SampleSet:
+        out = SampleSet(self.head, description, foreign=self._foreign)
         for sample in self._samples:
             out.add(sample)
         return out
@@ -295,7 +315,8 @@ def head_of(
         carrier = last.flange
     return SessionHead(
         camera=camera, setup="in_hand" if moves else "to_hand", parent=parent, carrier=parent if moves else carrier,
-        intrinsics=astuple(optics), board=board.model_dump(), robot=description.name, **more,
+        intrinsics=astuple(optics), board=board.model_dump(), robot=description.name,
+        **{"zeros_of": zeros_of(), **more},
     )  # fmt: skip
 
 

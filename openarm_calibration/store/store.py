@@ -79,6 +79,7 @@ class StoredCalibration(Record):
     board: str = Field(default="", description="that was observed")
     samples: int = Field(default=0, ge=0, description="that the result rests on")
     session: str = Field(default="", description="hash of the session file")
+    zeros: str = Field(default="", description="label of the joint zeros that it was found with; empty: as described")
     created: str = Field(default="", description="when, as ISO 8601")
     versions: dict[str, str] = Field(default_factory=dict, description="of the software")
 
@@ -125,9 +126,9 @@ class StoredCalibration(Record):
         return self.camera
 
     def fields(self) -> dict[str, Any]:
-        """Return what is written and hashed; a file of old has no intrinsics, or no robot, and keeps its hash."""
-        fields = super().fields()
-        return fields if self.intrinsics else {key: value for key, value in fields.items() if key != "intrinsics"}
+        """Return what is written and hashed; a file of old lacks intrinsics, zeros or robot, and keeps its hash."""
+        absent = {key for key in ("intrinsics", "zeros") if not getattr(self, key)}
+        return {key: value for key, value in super().fields().items() if key not in absent}
 
 
 class CalibrationStore(RecordStore[StoredCalibration]):

@@ -8,6 +8,7 @@ of the root link (`world`, identical to the base frame); joint positions are rad
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -21,14 +22,15 @@ import xacro
 from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import is_file
-from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, robot_name
+from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, other_robot, robot_name
 from openarm_common.robot.hand import Hand
 from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.meshes import take_meshes
 from openarm_common.robot.motors import JointMotion, Motors
-from openarm_common.robot.srdf import Semantics, parse_srdf
-from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf
+from openarm_common.robot.srdf import Semantics, parse_srdf, shifted
+from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf, rewritten
 from openarm_common.robot.xml_text import fault, parse_root
+from openarm_common.robot.zeros import read_zeros, zeros_path
 from openarm_common.types import Array
 
 __all__ = ["Joint", "Link", "Primitive", "RobotDescription"]
@@ -53,6 +55,7 @@ class RobotDescription:
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
         motion: What plans ask of the joints of an arm, where its folder says it.
         motors: Of each arm, where its folder says them.
+        zeros: By joint, where it is minus what it reports, rad or m; see `with_zeros`.
     """
 
     urdf: str
@@ -70,10 +73,14 @@ class RobotDescription:
     mirror: tuple[float, ...] = ()
     motion: JointMotion | None = None
     motors: Motors | None = None
+    zeros: Mapping[str, float] = field(default_factory=dict[str, float])
+    _described: RobotDescription | None = field(default=None, repr=False)
 
     @classmethod
     def load(cls, name: str = "") -> RobotDescription:
         """Return a robot of `models/robots`; expanded once a process.
+
+        The robot of this process has the zeros of its joints as they were calibrated, where `OPENARM_ZEROS` names them.
 
         Args:
             name: Of its folder; "": that of this process.
@@ -81,7 +88,8 @@ class RobotDescription:
         Raises:
             OpenArmError: INVALID_ARGUMENT, listing the robots there are; CONFIG_INVALID, when a file of it is faulty.
         """
-        return _loaded(name or robot_name())
+        mine = robot_name()
+        return _loaded(name or mine, zeros_path() if name in ("", mine) else "")
 
     @classmethod
     def from_folder(cls, name: str) -> RobotDescription:
@@ -170,18 +178,58 @@ class RobotDescription:
         if old.type != "prismatic":
             raise OpenArmError(Code.INVALID_ARGUMENT, f"joint {name!r} is {old.type}, expected one that slides")
         fixed = replace(old, type="fixed", T_parent_joint=old.T_parent_joint @ old.motion(position))
-        root = parse_root(self.urdf, "urdf")
-        element = next(joint for joint in root.findall("joint") if joint.get("name") == name)
-        element.set("type", "fixed")
-        origin = element.find("origin")
-        origin = ET.SubElement(element, "origin") if origin is None else origin
-        origin.set("xyz", " ".join(map(repr, fixed.T_parent_joint[:3, 3].tolist())))
+        lift = None if self.lift is not None and self.lift.joint == name else self.lift
+        return replace(self._with_joints(fixed), lift=lift)
+
+    def with_zeros(self, offsets: Mapping[str, float]) -> RobotDescription:
+        """Return the robot as its joints report it: one that reports `q` is at `q + offset` of the description.
+
+        Origins of the joints take the offsets up, limits and named postures are what the joints report there, so that
+        whatever reads the description takes and gives reported positions.
+
+        Args:
+            offsets: By joint, rad (m for one that slides); in addition to those that the robot has.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, as `joint`, for offsets that are not finite, and for joints that are fixed,
+                follow another one or are followed.
+        """
+        led = {joint.mimic for joint in self.joints.values()}
+        turned: list[Joint] = []
+        for name, offset in offsets.items():
+            joint = self.joint(name)
+            if joint.type == "fixed" or joint.mimic is not None or name in led or not math.isfinite(offset):
+                text = f"zero of joint {name!r}, {offset:g}: expected a finite offset of a joint that moves by itself"
+                raise OpenArmError(Code.INVALID_ARGUMENT, text)
+            origin = joint.T_parent_joint @ joint.motion(offset)
+            lower, upper = joint.lower - offset, joint.upper - offset
+            turned.append(replace(joint, T_parent_joint=origin, lower=lower, upper=upper))
+        semantics = self.semantics
+        states = {
+            key: MappingProxyType({name: q - offsets.get(name, 0.0) for name, q in state.items()})
+            for key, state in semantics.states.items()
+        }
+        return replace(
+            self._with_joints(*turned),
+            srdf=shifted(self.srdf, offsets),
+            semantics=replace(semantics, states=MappingProxyType(states)),
+            zeros={**self.zeros, **{name: self.zeros.get(name, 0.0) + offset for name, offset in offsets.items()}},
+            _described=self.described,
+        )
+
+    @property
+    def described(self) -> RobotDescription:
+        """The robot as its folder describes it: for true joint positions, which simulators and judges have."""
+        return self if self._described is None else self._described
+
+    def _with_joints(self, *joints: Joint) -> RobotDescription:
+        by_name = {joint.name: joint for joint in joints}
+        chains = {link: tuple(by_name.get(j.name, j) for j in chain) for link, chain in self._chains.items()}
         return replace(
             self,
-            urdf=ET.tostring(root, encoding="unicode"),
-            joints=MappingProxyType({**self.joints, name: fixed}),
-            _chains=MappingProxyType({k: tuple(fixed if j is old else j for j in c) for k, c in self._chains.items()}),
-            lift=None if self.lift is not None and self.lift.joint == name else self.lift,
+            urdf=rewritten(self.urdf, joints),
+            joints=MappingProxyType({name: by_name.get(name, joint) for name, joint in self.joints.items()}),
+            _chains=MappingProxyType(chains),
         )
 
     @property
@@ -353,7 +401,13 @@ class RobotDescription:
 
 
 @lru_cache(maxsize=8)
-def _loaded(name: str) -> RobotDescription:
+def _loaded(name: str, zeros: str) -> RobotDescription:
+    """Return a robot with the zeros of a file; the file of a run is written once."""
+    if zeros:
+        held = read_zeros(Path(zeros))
+        if text := other_robot(held.robot):
+            raise OpenArmError(Code.CONFIG_INVALID, f"{zeros} {text}")
+        return _loaded(name, "").with_zeros(held.offsets)
     return RobotDescription.from_folder(name)
 
 

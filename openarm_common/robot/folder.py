@@ -18,6 +18,7 @@ from openarm_common.robot.hand import HandParts
 from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.motors import JointMotion, Motors
 from openarm_common.robot.work import Work
+from openarm_common.robot.zeros import zeros_path
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -140,15 +141,15 @@ def other_robot(name: str) -> str:
 
 
 def per_robot(function: Callable[P, R]) -> Callable[P, R]:
-    """Cache a function by its arguments, which can be hashed, and by the folder of this process's robot."""
+    """Cache a function by its arguments, which can be hashed, by this process's robot and the zeros of its joints."""
 
     @cache
-    def made(folder: Path, *args: P.args, **kwargs: P.kwargs) -> R:
+    def made(folder: Path, zeros: str, *args: P.args, **kwargs: P.kwargs) -> R:
         return function(*args, **kwargs)
 
     @wraps(function)
     def of_this_robot(*args: P.args, **kwargs: P.kwargs) -> R:
-        return made(models_dir() / "robots" / robot_name(), *args, **kwargs)
+        return made(models_dir() / "robots" / robot_name(), zeros_path(), *args, **kwargs)
 
     return of_this_robot
 

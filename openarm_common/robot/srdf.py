@@ -35,6 +35,22 @@ def parse_srdf(text: str) -> Semantics:
     return Semantics(groups, MappingProxyType(states), pairs)
 
 
+def shifted(text: str, offsets: Mapping[str, float]) -> str:
+    """Return SRDF text with the named postures as joints report them that are at `position + offset` then.
+
+    Args:
+        text: SRDF, or "".
+        offsets: By joint, rad or m.
+    """
+    if not text:
+        return text
+    root = parse_root(text, "SRDF")
+    for element in root.findall("group_state/joint"):
+        if offset := offsets.get(attribute(element, "name")):
+            element.set("value", repr(floats(attribute(element, "value"), 1, element)[0] - offset))
+    return ET.tostring(root, encoding="unicode")
+
+
 def _state(element: ET.Element) -> tuple[tuple[str, str], Mapping[str, float]]:
     joints = {attribute(e, "name"): floats(attribute(e, "value"), 1, e)[0] for e in element.findall("joint")}
     return (attribute(element, "group"), attribute(element, "name")), MappingProxyType(joints)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, cast, get_args
 
@@ -140,6 +140,30 @@ def parse_urdf(text: str) -> tuple[str, dict[str, Link], dict[str, Joint]]:
             why = "does not exist" if leader is None else "is fixed or mimics a joint itself"
             raise fault(f"joint {joint.name!r} mimics {joint.mimic!r}, which {why}")
     return root.get("name", ""), links, joints
+
+
+def rewritten(text: str, joints: Iterable[Joint]) -> str:
+    """Return URDF text in which joints have the type, origin and limits given; the rest stays as it is.
+
+    Args:
+        text: Well-formed URDF.
+        joints: That the text has by these names.
+    """
+    root = parse_root(text, "URDF")
+    elements = {element.get("name"): element for element in root.findall("joint")}
+    for joint in joints:
+        element = elements[joint.name]
+        element.set("type", joint.type)
+        pose = element.find("origin")
+        pose = ET.SubElement(element, "origin") if pose is None else pose
+        if not np.array_equal(origin(element)[:3, :3], joint.T_parent_joint[:3, :3]):
+            pose.set("rpy", " ".join(map(repr, se3.rpy_from_matrix(joint.T_parent_joint[:3, :3]))))
+        pose.set("xyz", " ".join(map(repr, joint.T_parent_joint[:3, 3].tolist())))
+        limit = element.find("limit")
+        if limit is not None and math.isfinite(joint.lower):
+            limit.set("lower", repr(joint.lower))
+            limit.set("upper", repr(joint.upper))
+    return ET.tostring(root, encoding="unicode")
 
 
 def origin(element: ET.Element) -> Array:

@@ -95,7 +95,7 @@ def least_clearance(states: Iterable[tuple[int, Mapping[str, float]]]) -> float:
     Args:
         states: Stamp in ns, and position by joint; oldest first, as often as a control tick.
     """
-    description = RobotDescription.load()
+    description = RobotDescription.load().described
     world = Stage(description, load_cameras(), None, PhysicsConfig()).world(load_scene("empty"))
     clearance = ArmClearance(description, world.model)
     for t_ns, joints in states:

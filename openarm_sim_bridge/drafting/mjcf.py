@@ -340,15 +340,7 @@ def _shape(link: ET.Element, tag: str, name: str, T: Array, kind: str, **size: s
 
 
 def _origin(element: ET.Element, T: Array) -> None:
-    ET.SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(_rpy(T[:3, :3])))
-
-
-def _rpy(R: Array) -> tuple[float, float, float]:
-    """Roll, pitch, yaw of a rotation (3, 3); with the pitch upright, the yaw is 0."""
-    pitch = math.atan2(-R[2, 0], math.hypot(R[0, 0], R[1, 0]))
-    if math.hypot(R[0, 0], R[1, 0]) < 1e-9:
-        return math.atan2(-R[1, 2], R[1, 1]), pitch, 0.0
-    return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])
+    ET.SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(se3.rpy_from_matrix(T[:3, :3])))
 
 
 def _rotation(quaternion: ArrayLike) -> Array:

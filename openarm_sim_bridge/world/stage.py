@@ -24,7 +24,7 @@ class Stage:
     """Makes worlds from scenes.
 
     Args:
-        description: The robot.
+        description: The robot as the suite believes; what is simulated is as its folder describes it.
         cameras: By name.
         mount_seed: Of the camera mounts' errors; None is the nominal mounts.
         physics: Solver, contacts, fingers.
@@ -40,21 +40,22 @@ class Stage:
         hardware: HardwareConfig | None = None,
     ) -> None:
         self.description = description
+        self._described = described = description.described
         self._cameras = cameras
         self._mount_seed = mount_seed
         self._physics = physics
         self._hardware = hardware or IDEAL
-        made = drawn(self._hardware, description)
-        self._robot = robot_spec(description, physics, made)
-        lift = () if description.lift is None else (description.lift.joint,)
-        self.joint_names = (*joint_names(description), *lift)
-        self.encoders = made.encoders(description, self.joint_names)
+        made = drawn(self._hardware, described)
+        self._robot = robot_spec(described, physics, made)
+        lift = () if described.lift is None else (described.lift.joint,)
+        self.joint_names = (*joint_names(described), *lift)
+        self.encoders = made.encoders(described, self.joint_names)
         self.home: dict[str, float] = {}
-        if description.lift is not None:
-            self.home[description.lift.joint] = description.lift.home
-        for side in description.arm_names:
-            self.home |= description.group_state(f"{side}_arm", "home") | {
-                description.finger_joint(side): description.hand(side).closed
+        if described.lift is not None:
+            self.home[described.lift.joint] = described.lift.home
+        for side in described.arm_names:
+            self.home |= described.group_state(f"{side}_arm", "home") | {
+                described.finger_joint(side): described.hand(side).closed
             }
 
     @cached_property
@@ -103,8 +104,8 @@ class Stage:
         Raises:
             OpenArmError: INVALID_ARGUMENT, naming the keyframes there are.
         """
-        states = self.description.semantics.states
-        groups = [f"{side}_arm" for side in self.description.arm_names]
+        states = self._described.semantics.states
+        groups = [f"{side}_arm" for side in self._described.arm_names]
         known = sorted({name for group, name in states if group in groups})
         if keyframe not in known:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no keyframe {keyframe!r}; keyframes: {', '.join(known)}")
@@ -112,7 +113,7 @@ class Stage:
         return self.home | {joint: position for state in found for joint, position in state.items()}
 
     def _spec(self, scene: Scene) -> mujoco.MjSpec:
-        return build_spec(self.description, scene, self._cameras, self._mount_seed, self._physics, robot=self._robot)
+        return build_spec(self._described, scene, self._cameras, self._mount_seed, self._physics, robot=self._robot)
 
 
 def without_object(scene: Scene, name: str) -> Scene:

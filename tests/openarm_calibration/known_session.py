@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -60,13 +61,19 @@ def make_session(
     speed: float = 0.0,
     spread: float = 0.35,
     seed: int = 0,
+    arm: str = "right",
+    zeros: Mapping[str, float] | None = None,
 ) -> Known:
-    """Return samples at random joints around a view of the board; with `speed` (rad/s) the arm moves at every image."""
+    """Return samples at random joints around a view of the board.
+
+    With `speed` (rad/s) the arm moves at every image; `arm` holds the board of a fixed camera; joints report their
+    positions minus `zeros` (rad).
+    """
     rng = np.random.default_rng(seed)
     description = RobotDescription.load()
     cameras = load_cameras()
     camera = cameras["wrist" if setup == "in_hand" else "overhead"]
-    carrier = camera.parent if setup == "in_hand" else "openarm_right_link7"
+    carrier = camera.parent if setup == "in_hand" else f"openarm_{arm}_link7"
     k = camera.intrinsics
     head = SessionHead(
         camera=camera.name, setup=setup, parent=camera.parent, carrier=carrier, mount_seed=1,
@@ -74,7 +81,7 @@ def make_session(
     )  # fmt: skip
     samples = SampleSet(head, description)
     names = samples.joint_names
-    home = description.group_state("right_arm", "home")
+    home = description.group_state(f"{arm}_arm", "home")
     middle = np.array([home[name] for name in names])
     X = true_mount(camera, 1) @ T_LINK_OPTICAL
     A = samples.pose(dict(zip(names, middle, strict=True)))
@@ -101,6 +108,6 @@ def make_session(
             (t + 10**7 * j, dict(zip(names, (q + v * 0.01 * j).tolist(), strict=True))) for j in range(-10, 11)
         )
         detection = BoardDetection(np.arange(len(BOARD.points)), pixels + rng.normal(0.0, px, pixels.shape), px)
-        joints = dict(zip(names, q.tolist(), strict=True))
+        joints = {name: at - (zeros or {}).get(name, 0.0) for name, at in zip(names, q.tolist(), strict=True)}
         samples.add(Sample(f"s{len(samples) + 1:03d}", t, t, joints, speed, detection, T, b"", track if speed else ()))
     return Known(samples, X, description)

@@ -16,7 +16,8 @@ from openarm_calibration.handeye.kinematics import Kinematics
 from openarm_calibration.handeye.solve import SolveConfig
 from openarm_calibration.handeye.transforms import difference
 from openarm_calibration.handeye.unknowns import Noise
-from openarm_calibration.handeye.zeros import ZerosConfig, arm_views, solve_zeros
+from openarm_calibration.handeye.zero_sets import arm_views
+from openarm_calibration.handeye.zeros import ZerosConfig, solve_zeros
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 
@@ -69,7 +70,7 @@ def test_a_prior_of_zero_takes_a_joint_for_true_and_one_of_a_joint_that_stands_s
     made = trial(ROBOT, np.random.default_rng(3), count=8, off=0.0)
     views = [view for view in made.views if view.view.board == 0]
     optics = made_optics(views)
-    config = ZerosConfig(by_joint={RIGHT[3]: 0.0}, solver=LAX)
+    config = ZerosConfig(sigma=math.radians(1.0), by_joint={RIGHT[3]: 0.0}, solver=LAX)
     found = solve_zeros(ROBOT, views, optics, config)
     assert abs(found.values[3]) < 1e-5
     assert f"{RIGHT[3]}: taken for true" in found.sentences()

@@ -9,6 +9,7 @@ from typing import Any
 
 from openarm_bringup.bags.bag import Bag
 from openarm_bringup.bags.ros.messages import contents, message_of, messages_of
+from openarm_bringup.supervision.environment import name_of_zeros
 from openarm_calibration.board.board import Board
 from openarm_calibration.ros.image_capture import grey
 from openarm_calibration.sampling.gate import GateConfig
@@ -65,12 +66,12 @@ def samples_of(
     seed = mount_seed if mount_seed is not None else _seed(bag)
     head = head_of(
         camera, parent, small.robot, optics, board, carrier,
-        base=base, mount_seed=seed if simulated else None,
+        base=base, mount_seed=seed if simulated else None, zeros_of=name_of_zeros(_bridge(bag)),
     )  # fmt: skip
     # a session file of a robot that this suite does not have keeps its description
     link = head.parent if head.setup == "in_hand" else head.carrier
     ours = link in own.links and all(joint.name in own.joints for joint in small.robot.chain(link))
-    samples = SampleSet(head, small.robot, foreign=not ours)
+    samples = SampleSet(head, own.described if ours else small.robot, foreign=not ours)
     images = f"/{camera}{_IMAGES}"
     # The first bytes of a message are its stamp; the pixels are read in a second pass, where they are needed.
     with contents(bag):
@@ -152,13 +153,18 @@ def _ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
     return out
 
 
-def _seed(bag: Bag) -> int | None:
-    """Mount seed of the simulation that a bag was recorded from, by the parameters it carries."""
+def _bridge(bag: Bag) -> dict[str, Any] | None:
+    """Return the parameters of the simulation that a bag was recorded from; None: it is of none, or says nothing."""
     try:
         nodes: Any = parse_yaml(bag.custom.get("parameters", ""), "parameters")
-        seed = nodes["mujoco_bridge"]["ros__parameters"]["mount_seed"]
+        return dict(nodes["mujoco_bridge"]["ros__parameters"])
     except (OpenArmError, KeyError, TypeError):
-        return None  # of a real robot, or recorded by something else
+        return None
+
+
+def _seed(bag: Bag) -> int | None:
+    """Mount seed of the simulation that a bag was recorded from."""
+    seed = (_bridge(bag) or {}).get("mount_seed")
     return seed if isinstance(seed, int) and seed >= 0 else None
 
 

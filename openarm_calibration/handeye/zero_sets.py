@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From sessions of one robot to its joint zeros and the mounts of its cameras, with what they predict; m, rad, px.
+
+Left-out poses are predicted by the other ones twice: with the zeros that these give, and with those of the description.
+Zeros that predict them no better are not to be stored.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from openarm_calibration.handeye.left_out import in_space_squares
+from openarm_calibration.handeye.marks import project
+from openarm_calibration.handeye.offline import versions
+from openarm_calibration.handeye.problem import chain, layout
+from openarm_calibration.handeye.unknowns import Solution
+from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, arm_problem, solve_zeros
+from openarm_calibration.sampling.samples import SampleSet
+from openarm_calibration.store.store import StoredCalibration
+from openarm_common import se3
+from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.zero_store import StoredZeros
+from openarm_common.robot.zeros import zeros_label
+from openarm_common.types import Array
+
+#: Groups of poses that are left out in turn.
+_FOLDS = 5
+#: Offsets that say "as described": far less than an encoder resolves, rad.
+_AS_DESCRIBED = 1e-7
+#: A zero that is farther off is more likely a wrong joint, sign or robot, rad.
+_LIKELY = math.radians(15.0)
+#: More poses left out than this share make an answer doubtful.
+_OUTLIERS = 0.1
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Median over poses that an answer did not see of the rms error of marks: in the image, px, and in space, m."""
+
+    px: float
+    metres: float
+
+
+@dataclass(frozen=True, eq=False)
+class ZerosCalibration:
+    """Zeros of a robot, the mounts that go with them, and whether to believe them.
+
+    Args:
+        result: Of the solver.
+        zeros: To be stored.
+        mounts: Of the cameras, to be stored with them.
+        before: Errors of left-out poses with the zeros of the description.
+        after: The same with the zeros that were found.
+        failures: Why they are not to be stored; none if they are.
+        warnings: What is doubtful.
+    """
+
+    result: ZerosResult
+    zeros: StoredZeros
+    mounts: tuple[StoredCalibration, ...]
+    before: Predicted
+    after: Predicted
+    failures: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it for `--json` and reports."""
+        solution = self.result.solution
+        return {
+            "zeros": self.zeros.model_dump(mode="json"),
+            "mounts": {mount.camera: mount.model_dump(mode="json") for mount in self.mounts},
+            "left_out": {"before": vars(self.before), "after": vars(self.after)},
+            "outliers": {outlier.name: outlier.reason for outlier in solution.outliers},
+            "noise": vars(solution.estimate.noise),
+            "failures": list(self.failures),
+            "warnings": list(self.warnings),
+        }
+
+
+def arm_views(sessions: Sequence[SampleSet]) -> tuple[tuple[ArmView, ...], tuple[Intrinsics, ...]]:
+    """Return the views of sessions, and the intrinsics of their cameras, as `solve_zeros` takes them.
+
+    Sessions of one camera on the same link share its mount; each session has a board of its own.
+
+    Args:
+        sessions: Of one robot, of any cameras and arms.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for sessions of different robots, or of one camera with different intrinsics.
+    """
+    robots = sorted({samples.head.robot for samples in sessions if samples.head.robot})
+    if len(robots) > 1:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, f"sessions of {', '.join(robots)}; joints have the same zeros in one robot only"
+        )
+    if len(whose := sorted({samples.head.zeros_of for samples in sessions})) > 1:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"sessions of {' and of '.join(whose)}: not the same joints")
+    mounts: dict[tuple[str, str], Intrinsics] = {}
+    out: list[ArmView] = []
+    for board, samples in enumerate(sessions):
+        place = samples.head.camera, samples.head.parent
+        if mounts.setdefault(place, samples.head.optics) != samples.head.optics:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"sessions of camera {place[0]!r} with different intrinsics; solve them apart"
+            )
+        chain = samples.kinematics(())
+        for sample, view in zip(samples.samples, samples.problem().views, strict=True):
+            name = f"{place[0]}_{board + 1}/{view.name}"
+            numbered = replace(view, camera=list(mounts).index(place), board=board, pose=len(out), name=name)
+            out.append(ArmView(numbered, chain.base, chain.tip, sample.joints, sample.T_camera_board))
+    return tuple(out), tuple(mounts.values())
+
+
+def calibrate_zeros(
+    sessions: Sequence[SampleSet],
+    config: ZerosConfig | None = None,
+    *,
+    hashes: Sequence[str] = (),
+    created: str = "",
+) -> ZerosCalibration:
+    """Find the zeros of the joints with the mounts of all cameras, and judge them by poses that are left out.
+
+    Args:
+        sessions: Of one robot; any number of cameras and arms.
+        config: Priors.
+        hashes: Of the sessions, for the record.
+        created: When, as ISO 8601, for the record.
+
+    Raises:
+        OpenArmError: As `arm_views` and `solve_zeros`.
+    """
+    config = config or ZerosConfig()
+    views, optics = arm_views(sessions)
+    described = sessions[0].description.described
+    result = solve_zeros(described, views, optics, config)
+    fixed = config.model_copy(update={"sigma": max(float(result.prior.max()), _AS_DESCRIBED)})
+    plain = config.model_copy(update={"sigma": _AS_DESCRIBED, "by_joint": {}})
+    before = _predicted(described, views, optics, plain, None)
+    after = _predicted(described, views, optics, fixed, result.solution)
+    joints = dict(zip(result.names, zip(result.values, result.sigma, result.told, strict=True), strict=True))
+    joints = {name: row for name, row in joints.items() if name in described.joints}
+    offsets = {name: float(value) if result.off else 0.0 for name, (value, _, _) in joints.items()}
+    places = list(dict.fromkeys((samples.head.camera, samples.head.parent) for samples in sessions))
+    zeros = StoredZeros(
+        of=sessions[0].head.zeros_of,
+        offsets=offsets,
+        sigma={name: float(sigma) for name, (_, sigma, _) in joints.items()},
+        by_prior=tuple(name for name, (_, _, told) in joints.items() if not told),
+        cameras=tuple(camera for camera, _ in places),
+        samples=int(np.count_nonzero(result.solution.used)),
+        sessions=tuple(hashes),
+        created=created,
+    )
+    mounts = tuple(
+        _mount(result, k, place, optics[k], next(s for s in sessions if s.head.camera == place[0]), zeros)
+        for k, place in enumerate(places)
+    )
+    failures, warnings = _doubts(result, before, after, len(views))
+    return ZerosCalibration(result, zeros, mounts, before, after, failures, warnings)
+
+
+def _doubts(
+    result: ZerosResult, before: Predicted, after: Predicted, views: int
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    failures: list[str] = []
+    warnings: list[str] = []
+    if not result.off:
+        failures.append("the samples show no joint whose zero is off: nothing is to be corrected")
+    elif not (after.metres < before.metres and after.px < before.px):
+        failures.append(
+            f"with the zeros left-out poses are predicted no better ({after.px:.2f} px, {after.metres * 1e3:.2f} mm)"
+            f" than without ({before.px:.2f} px, {before.metres * 1e3:.2f} mm); take more samples, of all joints"
+        )
+    for name, value, prior, told in zip(result.names, result.values, result.prior, result.told, strict=True):
+        if told and abs(value) > max(_LIKELY, 4.0 * prior):
+            failures.append(
+                f"{name} seems off by {math.degrees(value):.1f}°, which no zero is: check order and signs of the"
+                " joints, and the robot (--robot)"
+            )
+    if result.solution.outliers:
+        count = len(result.solution.outliers)
+        names = ", ".join(outlier.name for outlier in result.solution.outliers)
+        text = f"{count} of {views} samples contradict the others and are left out: {names}"
+        (failures if count > 3 * _OUTLIERS * views else warnings).append(text)
+    return tuple(failures), tuple(warnings)
+
+
+def _predicted(
+    described: RobotDescription,
+    views: Sequence[ArmView],
+    optics: Sequence[Intrinsics],
+    config: ZerosConfig,
+    start: Solution | None,
+) -> Predicted:
+    """Return the errors of poses that are left out in turn."""
+    px: list[float] = []
+    space: list[float] = []
+    for fold in range(min(_FOLDS, len(views))):
+        kept = [view for k, view in enumerate(views) if k % _FOLDS != fold]
+        found = solve_zeros(described, kept, optics, config, start)
+        estimate = found.solution.estimate
+        left = [view for k, view in enumerate(views) if k % _FOLDS == fold]
+        problem = arm_problem(described, left, optics, found.names).posed(estimate.zeros)
+        T, _ = chain(problem, estimate.X, estimate.Z)
+        rows = problem.camera_rows(estimate.optics)
+        space += in_space_squares(problem, T).tolist()
+        for k, view in enumerate(problem.views):
+            away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
+            px.append(float(np.mean(np.sum(away**2, axis=1))))
+    return Predicted(math.sqrt(float(np.median(px))), math.sqrt(float(np.median(space))))
+
+
+def _mount(
+    result: ZerosResult,
+    number: int,
+    place: tuple[str, str],
+    optics: Intrinsics,
+    samples: SampleSet,
+    zeros: StoredZeros,
+) -> StoredCalibration:
+    """Return the mount of a camera for the store, with its predicted error where the zeros are those that were found.
+
+    Args:
+        result: Of the solver.
+        number: Of the camera.
+        place: Its name, and the link that carries it.
+        optics: Its intrinsics.
+        samples: One of its sessions.
+        zeros: To be stored with it.
+    """
+    estimate = result.solution.estimate
+    covariance: Array = estimate.covariance()
+    mine, others = slice(6 * number, 6 * number + 6), layout(result.solution.problem, estimate.extras)["zeros"]
+    across = covariance[mine, others]
+    given = covariance[mine, mine] - across @ np.linalg.solve(covariance[others, others], across.T)
+    variance = np.maximum(np.diag(given), 0.0)
+    views = result.solution.problem.camera[result.solution.used] == number
+    return StoredCalibration.of_mount(
+        *place, estimate.X[number] @ se3.inverse(T_LINK_OPTICAL), intrinsics=optics,
+        sigma_translation=math.sqrt(variance[:3].sum()), sigma_rotation=math.sqrt(variance[3:].sum()),
+        mount_seed=samples.head.mount_seed, board=samples.board.label, samples=int(np.count_nonzero(views)),
+        created=zeros.created, zeros=zeros_label(zeros.offsets), versions=versions(),
+    )  # fmt: skip
