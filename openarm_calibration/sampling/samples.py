@@ -313,10 +313,10 @@ def head_of(
     if not carrier:
         *_, last = RobotDescription.load().arms.values()  # that of a bag names no arms
         carrier = last.flange
+    more.setdefault("zeros_of", zeros_of())
     return SessionHead(
         camera=camera, setup="in_hand" if moves else "to_hand", parent=parent, carrier=parent if moves else carrier,
-        intrinsics=astuple(optics), board=board.model_dump(), robot=description.name,
-        **{"zeros_of": zeros_of(), **more},
+        intrinsics=astuple(optics), board=board.model_dump(), robot=description.name, **more,
     )  # fmt: skip
 
 
