@@ -117,7 +117,7 @@ def _prior(item: str) -> tuple[str, float]:
     except ValueError:
         what = "no number" if equals else "no ="
         raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"--prior {item}: {what}; expected joint=degrees, such as openarm_left_joint7=0.1"
+            Code.INVALID_ARGUMENT, f"--prior {item}: {what}; expected joint=degrees, such as JOINT=0.1"
         ) from None
 
 
