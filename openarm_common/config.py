@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Hashable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, ValidationError
@@ -161,13 +161,17 @@ def load_yaml(path: Path, code: Code = Code.CONFIG_INVALID) -> dict[str, Any]:
     Raises:
         OpenArmError: With `code`, when the file is missing, is not YAML, or is not a mapping; see `parse_yaml`.
     """
-    data = parse_yaml(read_text(path, code), str(path), code)
+    return _mapping(read_text(path, code), str(path), code)
+
+
+def _mapping(text: str, where: str, code: Code) -> dict[str, Any]:
+    data = parse_yaml(text, where, code)
     if data is None:
         return {}
     if not isinstance(data, dict):
-        raise OpenArmError(code, f"{path} holds a {type(data).__name__}, expected a mapping of keys")
+        raise OpenArmError(code, f"{where} holds a {type(data).__name__}, expected a mapping of keys")
     if unnamed := [key for key in data if not isinstance(key, str)]:  # pyright: ignore[reportUnknownVariableType]
-        raise OpenArmError(code, f"{path} has the key {brief(unnamed[0])}, expected names")  # pyright: ignore
+        raise OpenArmError(code, f"{where} has the key {brief(unnamed[0])}, expected names")  # pyright: ignore
     return data  # pyright: ignore[reportUnknownVariableType]
 
 
@@ -243,9 +247,14 @@ def describe_faults(error: ValidationError, where: str, model: type[BaseModel]) 
 
 
 def load_config(path: Path, model: type[ConfigT]) -> ConfigT:
-    """Read and validate a YAML file.
+    """Read and validate a YAML file; a text that has been read before is not parsed again.
 
     Raises:
         OpenArmError: CONFIG_INVALID, naming file and key.
     """
-    return validate(model, load_yaml(path), str(path))
+    return cast(ConfigT, _parsed(model, read_text(path), str(path)))
+
+
+@lru_cache(maxsize=64)
+def _parsed(model: type[BaseModel], text: str, where: str) -> BaseModel:
+    return validate(model, _mapping(text, where, Code.CONFIG_INVALID), where)

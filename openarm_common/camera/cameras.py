@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, field_validator
 
 from openarm_common import se3
-from openarm_common.config import Config, load_yaml, validate
+from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.folder import load_folder, per_robot, robot_name
 from openarm_common.types import Array, Floats
@@ -174,7 +174,7 @@ def load_cameras(path: Path | None = None) -> dict[str, CameraConfig]:
         if not robot.cameras:
             return {}
         path = folder / robot.cameras
-    cameras = validate(_CamerasFile, load_yaml(path), str(path)).cameras
+    cameras = load_config(path, _CamerasFile).cameras
     by_name = {camera.name: camera for camera in cameras}
     if len(by_name) != len(cameras):
         names = sorted(camera.name for camera in cameras)

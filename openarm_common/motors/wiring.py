@@ -11,7 +11,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from openarm_common.config import Config, load_yaml, validate
+from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.motors.axis import Axis
 from openarm_common.motors.frames import KD_MAX, KP_MAX, LAST_ID, motor_type
@@ -116,7 +116,7 @@ def load_wiring(robot: str | None = None) -> Wiring:
     if not path.is_file():
         text = f"{path}: missing; it says which motor drives which joint, so nothing can be sent to this robot's motors"
         raise OpenArmError(Code.CONFIG_INVALID, text)
-    return validate(Wiring, load_yaml(path), str(path))
+    return load_config(path, Wiring)
 
 
 def axes_of(wiring: Wiring, description: RobotDescription, buses: Mapping[str, str] | None = None) -> tuple[Axis, ...]:

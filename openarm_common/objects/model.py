@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
-from openarm_common.config import Config, load_yaml, validate
+from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.objects.decompose import decomposed
 from openarm_common.objects.obj_file import ObjMesh, read_obj
@@ -185,7 +185,7 @@ def _superquadric(seed: int) -> ObjectModel:
 @lru_cache(maxsize=128)
 def _read(source: str, folder: Path, _stamps: tuple[tuple[int, int], ...]) -> ObjectModel:
     described, collision = folder / "object.yaml", folder / "collision.obj"
-    said = validate(ObjectFile, load_yaml(described), str(described))
+    said = load_config(described, ObjectFile)
     visual = read_obj(folder / "visual.obj")
     _check_size(visual.vertices[np.unique(visual.triangles)], folder / "visual.obj")
     if is_file(collision):

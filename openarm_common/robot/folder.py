@@ -11,7 +11,7 @@ from typing import Literal, ParamSpec, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from openarm_common.config import Config, load_yaml, validate
+from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_common.robot.hand import HandParts
@@ -198,8 +198,7 @@ def read_folder(folder: Path) -> RobotFolder:
     Raises:
         OpenArmError: CONFIG_INVALID, naming what is wrong.
     """
-    path = folder / "robot.yaml"
-    return validate(RobotFolder, load_yaml(path), str(path))
+    return load_config(folder / "robot.yaml", RobotFolder)
 
 
 @per_robot

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from openarm_common.config import load_yaml, read_text, validate
+from openarm_common.config import load_config, read_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Joint, RobotDescription
 from openarm_common.robot.meshes import mesh_file
@@ -63,7 +63,7 @@ def draft_folder(
         raise OpenArmError(Code.INVALID_ARGUMENT, text)
     if not arms:
         raise OpenArmError(Code.INVALID_ARGUMENT, "expected at least one arm, as NAME=BASE_LINK:TIP_LINK")
-    wanted = Edits() if edits is None else validate(Edits, load_yaml(edits), str(edits))
+    wanted = Edits() if edits is None else load_config(edits, Edits)
     folder.mkdir(parents=True, exist_ok=True)
     urdf = folder / f"{folder.name}.urdf"
     if source.suffix == ".xml":

@@ -17,7 +17,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from openarm_common.config import Config, load_yaml, validate
+from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import read_folder
@@ -62,7 +62,7 @@ def read_source(folder: Path) -> SemanticsSource:
         OpenArmError: CONFIG_INVALID, naming what is wrong.
     """
     path = folder / SOURCE
-    return validate(SemanticsSource, load_yaml(path), str(path))
+    return load_config(path, SemanticsSource)
 
 
 def write_srdf(folder: Path, out: Path | None = None) -> tuple[Path, dict[Pair, str]]:
