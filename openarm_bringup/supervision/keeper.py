@@ -140,6 +140,7 @@ class Keeper:
             if supervisor.stop_asked.is_set():
                 raise asyncio.CancelledError
             self.process = process = await NodeProcess.start(argv, env, self.log)
+            self._ports = frozenset()
             supervisor.tell_guard(f"+{process.pid}")
         self._enter(NodeState.STARTING, f"pid {process.pid}")
         began = time.monotonic()
@@ -158,8 +159,7 @@ class Keeper:
                 getting_ready.result()
                 self._was_ready = True
                 self.ready.set()
-                self.mapped |= shm.mapped_by(process.pid)
-                self._ports = ports.used_by(process.pid, environment.domain_id(supervisor.graph))
+                self._note_what_it_uses(process.pid)
                 self._enter(NodeState.READY, f"after {ready_at - began:.1f} s")
             code = await ended
         finally:
@@ -168,9 +168,9 @@ class Keeper:
         ready_s = time.monotonic() - ready_at if self.ready.is_set() else 0.0
         self.ready.clear()
         supervisor.tell_guard(f"-{process.pid}")
-        if code < 0 or process.killed:
+        if code:
+            # It may not have taken leave of the others; its segments would take space that the next start needs.
             supervisor.ports.hold(self._ports)
-            # Killed processes leave their segments behind; free them before the next start needs the space.
             supervisor.say(await asyncio.to_thread(shm.clean_shm))
         return code, f"ended by signal {-code}" if code < 0 else f"ended with code {code}", ready_s
 
@@ -178,8 +178,14 @@ class Keeper:
         conditions = self.spec.ready
         while conditions and await self._supervisor.ask(lambda probe: probe.unmet(conditions, old)):
             await asyncio.sleep(self._supervisor.poll)
+            if self.process is not None:
+                self._note_what_it_uses(self.process.pid)
         if conditions and self.spec.params and not self._was_ready:
             await self._check_parameters()
+
+    def _note_what_it_uses(self, pid: int) -> None:
+        self.mapped |= shm.mapped_by(pid)
+        self._ports |= ports.used_by(pid, environment.domain_id(self._supervisor.graph))
 
     async def _check_parameters(self) -> None:
         """Refuse parameters that the node does not have; ROS would ignore them silently."""
