@@ -92,6 +92,22 @@ class Detection(Described):
         return float(np.arctan2(self.T_base_object[1, 0], self.T_base_object[0, 0]))
 
 
+def gap(a: Detection, b: Detection) -> float:
+    """Return the horizontal distance of the boxes of two objects, m; 0 where one is over the other."""
+    step, axes = (b.p_base - a.p_base)[:2], np.concatenate([d.T_base_object[:2, :2].T for d in (a, b)])
+    halves = [np.abs(axes @ d.T_base_object[:2, :2]) @ d.size[:2] / 2.0 for d in (a, b)]
+    if (np.abs(axes @ step) <= halves[0] + halves[1]).all():
+        return 0.0
+    return min(_nearest_corner(a, b), _nearest_corner(b, a))
+
+
+def _nearest_corner(a: Detection, b: Detection) -> float:
+    """Return the distance of the nearest corner of a box from another one, seen from above, m."""
+    corners = (np.indices((2, 2)).reshape(2, -1).T - 0.5) * a.size[:2] @ a.T_base_object[:2, :2].T + a.p_base[:2]
+    local = (corners - b.p_base[:2]) @ b.T_base_object[:2, :2]
+    return float(np.linalg.norm(np.maximum(np.abs(local) - b.size[:2] / 2.0, 0.0), axis=1).min())
+
+
 def kind_of(shape: str, size: Array) -> str:
     """Return the kind of a shape (box, cylinder, sphere) of measured edges (3,), m, the last the height."""
     if shape == "box":

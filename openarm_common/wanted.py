@@ -3,8 +3,9 @@
 
 Each word must be an attribute of the object (its name, colour or shape), or choose among those that fit; a relation
 compares it with another object that is described in the same way. No word is known beforehand: the attributes of what
-is in view are the vocabulary. Capitals and punctuation make no difference. Sides are those of the robot's view: left
-is +y of the base frame, right -y, behind +x, in front -x.
+is in view are the vocabulary. The easiest object lies under nothing, has room around it, and is seen surely. Capitals
+and punctuation make no difference. Sides are those of the robot's view: left is +y of the base frame, right -y, behind
++x, in front -x.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from openarm_common.detection import Described, Detection
+from openarm_common.detection import Described, Detection, gap
 from openarm_common.errors import Code, OpenArmError
 
 Words = tuple[str, ...]
@@ -36,20 +37,23 @@ _RELATIONS: Mapping[Words, tuple[float, float] | None] = {
     ("nearest", "to"): None,
     ("closest", "to"): None,
 }
-_CHOICES: Mapping[str, Callable[[Detection], float]] = {
-    "largest": lambda one: -float(np.prod(one.size)),
-    "biggest": lambda one: -float(np.prod(one.size)),
-    "smallest": lambda one: float(np.prod(one.size)),
-    "tallest": lambda one: -one.size[2],
-    "lowest": lambda one: one.size[2],
-    "leftmost": lambda one: -float(one.p_base[1]),
-    "left": lambda one: -float(one.p_base[1]),
-    "rightmost": lambda one: float(one.p_base[1]),
-    "right": lambda one: float(one.p_base[1]),
-    "nearest": lambda one: float(np.hypot(*one.p_base[:2])),
-    "closest": lambda one: float(np.hypot(*one.p_base[:2])),
-    "farthest": lambda one: -float(np.hypot(*one.p_base[:2])),
+_CHOICES: Mapping[str, Callable[[Detection, Sequence[Detection]], float]] = {
+    "easiest": lambda one, others: _trouble(one, others),
+    "largest": lambda one, _: -float(np.prod(one.size)),
+    "biggest": lambda one, _: -float(np.prod(one.size)),
+    "smallest": lambda one, _: float(np.prod(one.size)),
+    "tallest": lambda one, _: -one.size[2],
+    "lowest": lambda one, _: one.size[2],
+    "leftmost": lambda one, _: -float(one.p_base[1]),
+    "left": lambda one, _: -float(one.p_base[1]),
+    "rightmost": lambda one, _: float(one.p_base[1]),
+    "right": lambda one, _: float(one.p_base[1]),
+    "nearest": lambda one, _: float(np.hypot(*one.p_base[:2])),
+    "closest": lambda one, _: float(np.hypot(*one.p_base[:2])),
+    "farthest": lambda one, _: -float(np.hypot(*one.p_base[:2])),
 }
+#: Boxes nearer than this touch; a top that is so much higher is over another; more room counts no more, m.
+_TOUCHING, _HIGHER, _ROOM = 0.005, 0.01, 0.05
 _NO_PUNCTUATION = str.maketrans(dict.fromkeys(string.punctuation, " "))
 
 
@@ -102,7 +106,7 @@ def _select(text: str, words: Words, detections: Sequence[Detection]) -> list[De
         least = min(len(choices) for _, choices in read)
         found = [one for one, choices in read if len(choices) == least]
         for word in next(choices for _, choices in read if len(choices) == least):
-            found.sort(key=_CHOICES[word])
+            found.sort(key=lambda one: _CHOICES[word](one, detections))
         return found
     found = []
     relation = next((r for r in ((i, r) for i in range(len(words)) for r in _RELATIONS) if _at(words, *r)), None)
@@ -151,3 +155,14 @@ def _reach(one: Detection, others: Sequence[Detection], side: tuple[float, float
         if one is not other and (side is None or float(step @ side) >= math.cos(math.pi / 4.0) * distance):
             best = min(best, distance)
     return best
+
+
+def _trouble(one: Detection, detections: Sequence[Detection]) -> float:
+    """How hard an object is to take: what lies over it counts most, then neighbours, then a box that is unsure.
+
+    Fingers go down to about the middle of an object: what is lower is in no way.
+    """
+    higher = [(gap(one, other), other.top) for other in detections if other is not one and other.top > one.p_base[2]]
+    under = sum(distance < _TOUCHING and top > one.top + _HIGHER for distance, top in higher)
+    crowd = 1.0 - min([_ROOM, *(distance for distance, _ in higher)]) / _ROOM
+    return 2.0 * under + crowd + (1.0 - one.score) + 4.0 * (not one.measured)

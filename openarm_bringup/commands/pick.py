@@ -210,16 +210,18 @@ def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
 
 
 def order(
-    *labels: str, bins: Path | None = None, each: int = 1, domain: Domain = None, timeout: float = 300.0
+    *labels: str, bins: Path | None = None, each: int = 0, domain: Domain = None, timeout: float = 300.0
 ) -> Outcome:
     """Pick several objects of the running graph and place them, until nothing is left or nothing can be done.
 
-    `openarm order red --each 9` takes all that is red; with --bins, each class goes into its bin.
+    `openarm order anything` clears the table, `openarm order red` takes all that is red; the easiest comes first. What
+    cannot be taken is tried again when something else has been taken away, and listed at the end with the reason. With
+    --bins, each class goes into its bin, on a place that is free.
 
     Args:
         labels: What to pick, in this order: each words as for `pick`.
         bins: YAML with `bins` (rectangles x, y on the table, m), `classes` (bin of a label) and `rest` (bin of others).
-        each: Most objects of each.
+        each: Most objects of each label; 0 is all.
         timeout: Longest wait for one object, s.
     """
     from openarm_grasp.requests.orders import Order, load_bins
@@ -232,17 +234,22 @@ def order(
     with requires_node("grasp", "sim"), GraspClient() as client:
         while ask := work.next():
             try:
-                result = client.pick(ask.label, place=ask.place, exclude_near=ask.exclude_near, timeout=timeout)
+                result = client.pick(
+                    ask.label, exclude_near=ask.exclude_near, place_choices=ask.place_choices, timeout=timeout
+                )
             except KeyboardInterrupt:
                 data = {"placed": work.placed, "results": results}
                 return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED, data)
-            work.done(ask, result.code, result.message, result.place_position)
-            results.append({"label": ask.label, "place": ask.place, "code": result.code, "message": result.message})
+            seen = result.object_position
+            touched = result.attempts > 0
+            work.done(ask, result.code, result.message, result.place_position, seen, touched=touched)
+            row = {"label": ask.label, "position": seen and list(seen), "code": result.code, "message": result.message}
+            results.append({**row, "place": list(result.place_position) if result.success else None})
             shown.print(f"{ask.label}: {result.code}: {result.message}", markup=False)
-            if result.code in (Code.CANCELLED, Code.ROBOT_LOST, Code.NOT_READY):
-                raise OpenArmError(result.code, f"the order was stopped at {ask.label!r}: {result.message}")
     faults = work.faults()
-    data = {"outcome": work.outcome, "placed": work.placed, "faults": dict(faults), "results": results}
-    text = "; ".join(f"{label}: {why}" for label, why in faults.items())
-    message = f"{work.outcome}: {len(work.placed)} placed" + (f"; {text}" if text else "")
-    return Outcome(not faults, message, Code.OK if not faults else Code.PLACE_FAILED, data)
+    left = [{**asdict(one), "code": str(one.code)} for one in work.left]
+    data = {"outcome": work.outcome, "placed": work.placed, "left": left, "faults": list(faults), "results": results}
+    message = f"{work.outcome}: {len(work.placed)} placed, {len(work.left)} left"
+    return Outcome(
+        not faults, message, Code.OK if not faults else Code.PLACE_FAILED, data, "".join(f"left: {t}\n" for t in faults)
+    )

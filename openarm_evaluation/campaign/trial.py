@@ -95,7 +95,11 @@ class Trials:
         self._faulty = False
         #: Whether the fault of the task has begun.
         self.injected = False
-        self._placed_at: tuple[float, ...] = ()
+        #: Where the newest object was placed, and where it was seen before.
+        self._ends: tuple[tuple[float, ...], tuple[float, ...] | None] = ((), None)
+        #: Robot time of the requests of an order, s, and what it left, a sentence each.
+        self._seconds = 0.0
+        self._left: tuple[str, ...] = ()
 
     def run(self) -> dict[str, Any]:
         """Carry out the task and return its row."""
@@ -106,7 +110,8 @@ class Trials:
         began_ns = self.robot.t_ns
         trials = self._both() if self._task.together else self._all_in_turn()
         row = row_of(self._task, trials, time.monotonic() - began)
-        row["again"] = self._again
+        row["again"], row["left"] = self._again, list(self._left)
+        row["sim_s"] = round(self._seconds, 2) or row["sim_s"]
         if clearance is not None:
             add_clearance(row, clearance.least, (self.robot.t_ns - began_ns) * 1e-9)
         row["planning_ms_median"] = round(1e3 * float(np.median(self.robot.planning_s or [math.nan])), 1)
@@ -119,18 +124,23 @@ class Trials:
         labels, clear = self._task.labels, self._task.clear
         if not clear and len(set(labels)) < len(labels):  # the same object more than once
             return [self._grasp(GraspRequest(label)) for label in labels]
-        order, placed, open_ = Order(labels, each=Counter(labels)), list[Trial](), dict[str, Trial]()
+        order, placed, open_ = Order(labels, each=Counter(labels)), list[Trial](), dict[object, Trial]()
         while ask := order.next():
             trial = self._grasp(ask)
-            order.done(ask, Code(trial.answer.code), trial.answer.message, self._placed_at)
-            if trial.answer.success:
+            answer, touched = trial.answer, trial.answer.attempts > 0
+            order.done(ask, Code(answer.code), answer.message, *self._ends, touched=touched)
+            self._seconds += trial.sim_s
+            if answer.success:
                 placed.append(trial)
                 continue
-            open_[ask.label] = trial
-            if trial.answer.attempts and not clear:  # three attempts are what a scene may take
-                order.failed[ask.label] = trial.answer.message
-        missing = Counter(labels) - Counter(order.placed)
-        return [*placed, *(open_[label] for label in missing.elements())]
+            label = order.label_of(ask)
+            open_[order.left[-1] if order.left and order.left[-1].label == label else label] = trial
+            if touched and not clear:  # three attempts are what a scene may take
+                order.failed[label] = answer.message
+        self._left, missing = order.faults(), len(labels) - len(placed)
+        last = [open_[key] for key in (*order.left, *order.failed) if key in open_] or list(open_.values())
+        # what nothing was asked about was not seen: the last answer says so
+        return [*placed, *(last + last[-1:] * missing)[:missing]]
 
     def _grasp(self, ask: GraspRequest) -> Trial:
         robot, task = self.robot, self._task
@@ -144,7 +154,7 @@ class Trials:
         except OpenArmError as error:
             outcome = GraspOutcome(error.code, error.message, ask.label)
         wall_s = time.monotonic() - began
-        self._placed_at = outcome.place_position
+        self._ends = (outcome.place_position, outcome.object_position)
         return self._trial(ask.label, outcome, self.steps[first:], wall_s)
 
     def _both(self) -> list[Trial]:
@@ -215,9 +225,11 @@ class Trials:
         if not names:
             return Trial(task.scene, task.seed, "", outcome, None, steps, wall_s, end_ns)
         self._rest(names)
-        where = outcome.place_position
+        where, seen = outcome.place_position, outcome.object_position
         xy = (where[0], where[1]) if any(where) else (math.nan, math.nan)
         name = max(names, key=lambda n: rise_of(robot.tracks[n]))
+        if seen is not None and not outcome.attempts:  # nothing rose: that which was looked at
+            name = min(names, key=lambda n: float(np.linalg.norm(robot.tracks[n][0].p_world - np.array(seen))))
         any_shape = task.scene.object(name).shape == "mesh"
         verdict = judge(robot.tracks[name], xy, claimed=outcome.success, any_shape=any_shape)
         return Trial(task.scene, task.seed, name, outcome, verdict, steps, wall_s, end_ns)

@@ -60,6 +60,20 @@ class Sighting:
     clouds: tuple[LabelledCloud, ...] = ()
 
 
+class UntrustedError(OpenArmError):
+    """An object that is in view, but cannot be trusted.
+
+    Args:
+        code: Why.
+        message: Why, in a sentence.
+        where: (3,) where it seems to be, base frame, m.
+    """
+
+    def __init__(self, code: Code, message: str, where: Array) -> None:
+        super().__init__(code, message)
+        self.where = where
+
+
 def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Frame, ...]:
     """Frames of detections in the base frame.
 
@@ -185,10 +199,11 @@ def find(
         blurred = [f for f in frames if any(not d.measured and _same_thing(d, anchor) for d in f.detections)]
         if 3 * (len(track) + len(blurred)) >= 2 * len(frames):
             raise _not_measured(anchor)
-        raise OpenArmError(
+        raise UntrustedError(
             Code.STALE_DATA,
             f"{anchor.label!r} is in the same place in {len(track)} of {len(frames)} frames only: expected one within"
             f" {limits.match_radius * 1e3:.0f} mm of {_text(anchor.p_base)} in two thirds of them",
+            anchor.p_base,
         )
     spots = [d.p_base for d in track]
     if len(clouds) == len(track) and not all(d.kind for d in track):
@@ -197,10 +212,11 @@ def find(
     limit = limits.agree_within if all(d.kind for d in track) or not clouds else limits.shape_agrees_within
     steps = [float(np.linalg.norm(a - b)) for a, b in pairwise(spots)]
     if steps and max(steps) > limit:
-        raise OpenArmError(
+        raise UntrustedError(
             Code.STALE_DATA,
             f"{anchor.label!r} moved {max(steps) * 1e3:.1f} mm between two frames, expected at most"
             f" {limit * 1e3:.1f} mm; is it at rest?",
+            anchor.p_base,
         )
     target = average(track)
     others = _others(frames, target, limits.match_radius)
@@ -256,9 +272,9 @@ def _same_thing(a: Detection, b: Detection) -> bool:
     return a.label == b.label and apart(a, b) <= SAME_PLACE
 
 
-def _not_measured(d: Detection) -> OpenArmError:
+def _not_measured(d: Detection) -> UntrustedError:
     why = _WHY.get(d.code, "cannot be measured: something hides its outline, or the border of the image cuts it")
-    return OpenArmError(d.code, f"{d.label!r} is in view at about {_text(d.p_base)}, but {why}")
+    return UntrustedError(d.code, f"{d.label!r} is in view at about {_text(d.p_base)}, but {why}", d.p_base)
 
 
 #: Why nothing that a camera sees is a target; its detector knows the figures.

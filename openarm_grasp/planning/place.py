@@ -8,7 +8,7 @@ way may stand another.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import product
 from math import hypot, inf
 
@@ -141,9 +141,14 @@ def turns_to(target: Detection, yaw: float) -> tuple[float, ...]:
 
 
 def free_spots(
-    arm: str, target: Detection, others: Sequence[Detection], config: GraspConfig, shoulders: Shoulders
+    arm: str,
+    target: Detection,
+    others: Sequence[Detection],
+    config: GraspConfig,
+    shoulders: Shoulders,
+    choices: Sequence[Sequence[float]] = (),
 ) -> tuple[Array, ...]:
-    """Free spots on the arm's side of the table, best first.
+    """Free spots, best first: of those that may be chosen, or anywhere on the arm's side of the table.
 
     A spot keeps its distance from every other object and from where the object came. Those come first that leave room
     for a hand around the others; among them, room around it counts (up to twice the distance asked for) and nearness to
@@ -155,20 +160,23 @@ def free_spots(
         others: Other objects in view.
         config: Parameters.
         shoulders: Of the arms.
+        choices: (x, y) of spots, base frame, m; none: a grid on the arm's side.
 
     Raises:
         OpenArmError: PLACE_FAILED, when nothing is free.
     """
     place = config.place
     ys = np.concatenate([grid(*place.region_abs_y, place.spot_step) * side for side in sides(arm, shoulders)])
+    spots = choices or [*product(grid(*place.region_x, place.spot_step), ys)]
     ranked = [
         (clearance < place.neighbour_room, cost, x, y)
-        for cost, clearance, x, y in clear_spots(grid(*place.region_x, place.spot_step), ys, target, others, place)
+        for cost, clearance, x, y in clear_spots(spots, target, others, place)
     ]
     if not ranked:
+        what = f"none of {len(choices)} places is free" if choices else f"no free spot for the {arm} arm"
         raise OpenArmError(
             Code.PLACE_FAILED,
-            f"no free spot for the {arm} arm: none is {place.neighbour_distance * 1e3:.0f} mm from"
+            f"{what}: none is {place.neighbour_distance * 1e3:.0f} mm from"
             f" {len(others)} other objects and {place.origin_distance * 1e3:.0f} mm from where it stood",
         )
     # Six spots side by side would share one fate, so those offered lie apart.
@@ -183,17 +191,12 @@ def free_spots(
 
 
 def clear_spots(
-    xs: Sequence[float] | Array,
-    ys: Sequence[float] | Array,
-    target: Detection,
-    others: Sequence[Detection],
-    config: PlaceConfig,
+    spots: Iterable[Sequence[float]], target: Detection, others: Sequence[Detection], config: PlaceConfig
 ) -> list[tuple[float, float, float, float]]:
-    """Spots of a grid that keep their distance from other objects and from where the object came from.
+    """Spots that keep their distance from other objects and from where the object came from.
 
     Args:
-        xs: Of the grid, base frame, m.
-        ys: Of the grid, base frame, m.
+        spots: (x, y) of each, base frame, m.
         target: The object as it stood at the grasp.
         others: Other objects in view.
         config: The distances.
@@ -203,7 +206,8 @@ def clear_spots(
         from, less the clearance up to twice the distance asked for.
     """
     found: list[tuple[float, float, float, float]] = []
-    for x, y in product(map(float, xs), map(float, ys)):
+    for spot in spots:
+        x, y = float(spot[0]), float(spot[1])
         origin = hypot(x - target.p_base[0], y - target.p_base[1])
         clearance = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
         if origin >= config.origin_distance and clearance >= config.neighbour_distance:

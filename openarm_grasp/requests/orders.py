@@ -7,7 +7,6 @@ what came of it. Bins are rectangles on the table, base frame, m.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,12 +21,14 @@ from openarm_grasp.requests.request import GraspRequest
 
 #: (x, y), base frame, m.
 Spot = tuple[float, float]
-#: With these another place in a bin may be had.
-_BLOCKED = (Code.IN_COLLISION, Code.UNREACHABLE, Code.NO_PLAN)
-#: Nothing changes these. With any other, what others hid or blocked may be had when they have been taken away.
-_FINAL = (Code.TOO_WIDE, Code.INVALID_ARGUMENT, Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
+#: What is asked for first of all that fits: see `openarm_common.wanted`.
+_FIRST = "easiest"
+#: With these there is nothing more to ask for, whatever it is.
+_OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 #: There is no more of it in view.
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
+#: Requests of one label that moved an arm in vain, one after the other, until it is given up.
+_IN_VAIN = 3
 
 
 class Bin(Config):
@@ -76,26 +77,56 @@ def load_bins(path: Path) -> Bins:
     return load_config(path, Bins)
 
 
+@dataclass(frozen=True)
+class Left:
+    """An object that an order left where it is.
+
+    Attributes:
+        label: Words that it was asked for by.
+        where: Where it was seen, base frame, m; None: that is not known.
+        code: Why it was left.
+        why: Why, in a sentence.
+        after: Objects that had been placed by then.
+    """
+
+    label: str
+    where: Spot | None
+    code: Code
+    why: str
+    after: int
+
+    def __str__(self) -> str:
+        """Sentence for the report."""
+        at = "" if self.where is None else f" at ({self.where[0]:.3f}, {self.where[1]:.3f}) m"
+        return f"{self.label}{at}: {self.code}: {self.why}"
+
+
 @dataclass
 class Order:
-    """Objects to be picked one after the other.
+    """Objects to be picked one after the other: of those that fit, the easiest first.
+
+    What cannot be taken is left until all others have been tried, and asked for again when something has been taken
+    away since: it may have been in the way, or have hidden it. The order ends when nothing is left, or nothing can be
+    done about what is.
 
     Attributes:
         labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
         bins: Where they go; None: to free spots.
-        each: Most objects of one label, or of each label.
+        each: Most objects of one label, or of each label; 0: all.
         placed: Labels that were placed, in order.
-        failed: What could not be done: label and reason.
+        left: What could not be taken.
+        failed: Labels that could not be asked for, or were never there, and why.
     """
 
     labels: Sequence[str]
     bins: Bins | None = None
-    each: int | Mapping[str, int] = 1
+    each: int | Mapping[str, int] = 0
     placed: list[str] = field(default_factory=list[str])
+    left: list[Left] = field(default_factory=list[Left])
     failed: dict[str, str] = field(default_factory=dict[str, str])
-    _used: Counter[str] = field(default_factory=Counter[str])
-    _blocked: dict[str, tuple[int, str]] = field(default_factory=dict[str, tuple[int, str]])
     _stand: list[Spot] = field(default_factory=list[Spot])
+    _ended: dict[str, int] = field(default_factory=dict[str, int])
+    _in_vain: int = 0
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -112,49 +143,83 @@ class Order:
 
     def next(self) -> GraspRequest | None:
         """The next request; None when the order has ended."""
+        if self.over:
+            return None
         for label in dict.fromkeys(self.labels):
             most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
-            if label in self.failed or self.placed.count(label) >= most:
+            if label in self.failed or (most and self.placed.count(label) >= most):
                 continue
-            if label in self._blocked and self._blocked[label][0] == len(self.placed):
+            if self._ended.get(label) == len(self.placed):
                 continue  # nothing has been taken away since
-            stand = tuple(self._stand)  # whatever it was asked for as, it is not asked for again
-            if self.bins is None:
-                return GraspRequest(label, exclude_near=stand)
-            name = self.bins.of(label)
-            slots = self.bins.bins[name].slots(self.bins.spacing)
-            at = self._used[name]
-            if at < len(slots):
-                return GraspRequest(label, place=slots[at], exclude_near=stand)
-            self.failed[label] = f"bin {name!r} is full: it has {len(slots)} places"
-        self.failed |= {label: why for label, (_, why) in self._blocked.items()}
+            spots = () if self.bins is None else self.bins.bins[self.bins.of(label)].slots(self.bins.spacing)
+            # whatever it was asked for as, what was placed or left is not asked for again
+            left = (one.where for one in self.left if one.where is not None)
+            return GraspRequest(f"{_FIRST} {label}", exclude_near=(*self._stand, *left), place_choices=spots)
         return None
 
-    def done(self, request: GraspRequest, code: Code, message: str, where: Sequence[float] = ()) -> None:
-        """Note what came of a request; `where` (x, y) is where the object stands now, when it was placed."""
-        label = request.label
-        self._blocked.pop(label, None)
-        next_slot = code is Code.OK or (code in _BLOCKED and request.place is not None)
-        if self.bins is not None and next_slot:
-            self._used[self.bins.of(label)] += 1
+    @staticmethod
+    def label_of(request: GraspRequest) -> str:
+        """Which of the labels a request is for."""
+        return request.label.removeprefix(f"{_FIRST} ")
+
+    def done(
+        self,
+        request: GraspRequest,
+        code: Code,
+        message: str,
+        placed: Sequence[float] = (),
+        seen: Sequence[float] | None = None,
+        *,
+        touched: bool = False,
+    ) -> None:
+        """Note what came of a request.
+
+        Args:
+            request: From `next`.
+            code: Of the answer.
+            message: Of the answer.
+            placed: (x, y) where the object stands now, when it was placed.
+            seen: (x, y) where it was seen, when it was.
+            touched: An arm has moved for it.
+        """
+        label = self.label_of(request)
+        self.left = [one for one in self.left if one.label != label or one.where is not None]
+        self._in_vain = self._in_vain + 1 if touched and code is not Code.OK else 0
         if code is Code.OK:
             self.placed.append(label)
-            if len(where) >= 2:
-                self._stand.append((float(where[0]), float(where[1])))
-        elif code in _FINAL:
+            if len(placed) >= 2:
+                self._stand.append((float(placed[0]), float(placed[1])))
+        elif code in _GONE and seen is None:
+            self._none_left(label, code, message)
+        elif code in (*_OVER, Code.INVALID_ARGUMENT):
             self.failed[label] = f"{code}: {message}"
-        elif self.bins is None or not next_slot:
-            # No more of it in view, when some was placed, is what was asked for.
-            why = "" if code in _GONE and label in self.placed else f"{code}: {message}"
-            self._blocked[label] = (len(self.placed), why)
+        else:
+            where = None if seen is None else (float(seen[0]), float(seen[1]))
+            self.left.append(Left(label, where, code, message, len(self.placed)))
+            if where is None or self._in_vain >= _IN_VAIN:
+                self._ended[label], self._in_vain = len(self.placed), 0
+
+    def _none_left(self, label: str, code: Code, message: str) -> None:
+        """Nothing more of a label is in view besides what was left: that is tried again if it may have become free."""
+        again = [one for one in self.left if one.label == label and one.after < len(self.placed)]
+        self.left = [one for one in self.left if one not in again]
+        if not again:
+            self._ended[label] = len(self.placed)
+            if label not in self.placed and all(one.label != label for one in self.left):
+                self.left.append(Left(label, None, code, message, len(self.placed)))
+
+    @property
+    def over(self) -> bool:
+        """Whether the robot cannot go on."""
+        return any(text.startswith(tuple(f"{code}:" for code in _OVER)) for text in self.failed.values())
 
     @property
     def outcome(self) -> str:
-        """SUCCESS when nothing failed, PARTIAL when something was placed, else FAILED."""
-        if not any(self.failed.values()):
+        """SUCCESS when nothing is left, PARTIAL when something was placed, else FAILED."""
+        if not self.faults():
             return "SUCCESS"
         return "PARTIAL" if self.placed else "FAILED"
 
-    def faults(self) -> Mapping[str, str]:
-        """What could not be done, by label."""
-        return {label: why for label, why in self.failed.items() if why}
+    def faults(self) -> tuple[str, ...]:
+        """What could not be done, a sentence each."""
+        return (*map(str, self.left), *(f"{label}: {why}" for label, why in self.failed.items()))

@@ -39,6 +39,7 @@ class GraspRequest:
         timeout: s of robot time for all of it; 0: none.
         object_at: (x, y) near which the object is, base frame, m; None: any that is called so.
         exclude_near: (x, y) of objects that stay where they are, base frame, m.
+        place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
         why: What it is for, when it is a part of another request.
         same: The object, when an earlier part of the request was about it: as it was seen or left then.
     """
@@ -53,6 +54,7 @@ class GraspRequest:
     timeout: float = 0.0
     object_at: tuple[float, ...] | None = None
     exclude_near: tuple[tuple[float, float], ...] = ()
+    place_choices: tuple[tuple[float, float], ...] = ()
     why: str = ""
     same: Sighting | None = None
 
@@ -150,6 +152,7 @@ class GraspOutcome:
         arm: The arm that was used, or "".
         attempts: Physical attempts.
         place_position: (3,) target that was used, base frame, m; zeros when none.
+        object_position: (3,) where the object was seen last before it was lifted, base frame, m; None: it was not.
         duration: s of robot time.
         held: The object is in the hand.
         moved: It is elsewhere than before, and not where it was asked for; the message says where.
@@ -169,6 +172,7 @@ class GraspOutcome:
     arm: str = ""
     attempts: int = 0
     place_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    object_position: tuple[float, float, float] | None = None
     duration: float = 0.0
     held: bool = False
     moved: bool = False

@@ -25,10 +25,10 @@ from openarm_grasp.planning.candidates import (
     GraspCandidate,
     PlaceTarget,
     held_boxes,
-    obstacle_boxes,
     target_box,
     target_boxes,
 )
+from openarm_grasp.planning.neighbours import neighbours
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
 #: The map shows an object so much wider than it is, m.
@@ -137,7 +137,7 @@ class Skills:
         """
         config = self._config
         target = target_boxes(found.target, ways[0] if ways else None, config)
-        obstacles = obstacle_boxes(found.others, config)
+        obstacles = neighbours(found, target, config)
         gone = () if now is None else (target_box(now.target, config),)
         return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone))
 
@@ -158,7 +158,8 @@ class Skills:
             candidate: How the hand holds it.
             after: Trajectory whose end is the start; None starts at the present joints.
         """
-        held, obstacles = held_boxes(found.target, candidate, self._config), obstacle_boxes(found.others, self._config)
+        held = held_boxes(found.target, candidate, self._config)
+        obstacles = neighbours(found, target_boxes(found.target, candidate, self._config), self._config)
         stood, lift = target_box(found.target, self._config), self._config.approach.lift_height
         grown = np.array([2.0 * _CELL, 2.0 * _CELL, lift])
         column = Box(stood.id, se3.make(p=(0.0, 0.0, 0.5 * lift)) @ stood.T_frame_box, stood.size + grown)

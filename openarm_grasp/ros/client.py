@@ -40,6 +40,7 @@ class GraspResult(Answer):
         arm: The arm that was used, or "".
         attempts: Physical attempts.
         place_position: (x, y, z) of the target on the table, base frame, m.
+        object_position: (x, y, z) where the object was seen last before it was lifted, base frame, m; None: it was not.
         duration: s of robot time.
         route: "direct"; "hand_over": by way of the middle, with both arms; "push": pushed into reach; "" when it was
             not placed.
@@ -54,6 +55,7 @@ class GraspResult(Answer):
     attempts: int
     place_position: tuple[float, float, float]
     duration: float
+    object_position: tuple[float, float, float] | None = None
     route: str = ""
     options: tuple[Option, ...] = ()
     state_times: tuple[StateTime, ...] = ()
@@ -107,6 +109,7 @@ class GraspClient(BackgroundNode):
         place_yaw: float | None = None,
         object_at: Sequence[float] | None = None,
         exclude_near: Sequence[Sequence[float]] = (),
+        place_choices: Sequence[Sequence[float]] = (),
         phase: str = "all",
         dry_run: bool = False,
         confirm: OnPlan | bool = False,
@@ -124,6 +127,7 @@ class GraspClient(BackgroundNode):
             place_yaw: Of the object's x axis about the base z where it is put down, rad; None: unconstrained.
             object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
             exclude_near: (x, y) of objects that stay where they are.
+            place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
             phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
             dry_run: Plan and report, do not move.
             confirm: Called in the thread of the caller with the `GraspStatus` of each plan that waits (its `plan_id`,
@@ -143,6 +147,7 @@ class GraspClient(BackgroundNode):
         goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit)
         _where(goal, place, place_yaw, object_at)
         goal.exclude_near = [point((p[0], p[1], 0.0)) for p in exclude_near]
+        goal.place_choices = [point((p[0], p[1], 0.0)) for p in place_choices]
         goal.confirm = bool(confirm)
         return _result(self._ask(Pick, "/grasp/pick", goal, timeout, on_feedback, confirm))
 
@@ -251,7 +256,9 @@ def _result(message: Pick.Result | PickResult) -> GraspResult:
     if not isinstance(message, PickResult):
         same |= {"options": tuple(map(option_from_msg, message.options)), "recording": message.recording}
     times = tuple(StateTime(one.state, one.duration, one.budget, one.longest) for one in message.state_times)
-    return GraspResult(**same, place_position=(x, y, z), state_times=times)
+    u, v, w = (float(value) for value in xyz(message.object_position))
+    seen = (u, v, w) if message.has_object_position else None
+    return GraspResult(**same, place_position=(x, y, z), object_position=seen, state_times=times)
 
 
 def _same(message: Pick.Result | PickResult | PickTwo.Result, *names: str) -> dict[str, Any]:

@@ -55,6 +55,7 @@ def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
         phase=message.phase or "all",
         timeout=message.timeout,
         exclude_near=tuple((p.x, p.y) for p in message.exclude_near),
+        place_choices=tuple((p.x, p.y) for p in message.place_choices),
     )
 
 
@@ -82,6 +83,8 @@ def fill_answer(answer: Grasp.Response | Pick.Result | PickResult, outcome: Gras
         setattr(answer, name, getattr(outcome, name))
     answer.outcome, answer.code = outcome.kind, outcome.code.value
     answer.place_position = point(outcome.place_position)
+    if outcome.object_position is not None:
+        answer.has_object_position, answer.object_position = True, point(outcome.object_position)
     answer.state_times = [StateTimeMsg(**asdict(one)) for one in outcome.state_times]
     if not isinstance(answer, PickResult):
         answer.options = [option_to_msg(option) for option in outcome.options]

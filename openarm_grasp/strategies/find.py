@@ -12,7 +12,7 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.wanted import describe
 from openarm_grasp.evidence.verdicts import Verdict
-from openarm_grasp.perception.detections import Frame, Sighting, in_view, on_table
+from openarm_grasp.perception.detections import Frame, Sighting, UntrustedError, in_view, on_table
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.arms import out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
@@ -130,7 +130,12 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
         others = (d for d in newest.detections if d.label != kept.sighting.target.label)
         sighting = Sighting(kept.sighting.target, _standing(others, top_z), newest.t_ns)
     else:
-        found = request.find(frames, limits)
+        try:
+            found = request.find(frames, limits)
+        except UntrustedError as error:
+            run.seen_at = error.where
+            raise
+        run.seen_at = found.target.p_base
         target = on_table(found.target, top_z)
         sighting = replace(found, target=target, others=_standing(found.others, top_z))
     age = (run.robot.now_ns - sighting.t_ns) * 1e-9
@@ -240,7 +245,7 @@ def _grasp(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) ->
     if request.place is not None:
         spots = (check_position(request.place, target, others, table),)
     else:
-        spots = free_spots(arm, target, others, run.config, run.context.shoulders)
+        spots = free_spots(arm, target, others, run.config, run.context.shoulders, request.place_choices)
     yaw = request.place_yaw
     return Grasp(
         arm, sighting, candidate, place_targets(target, candidate, spots, run.config, run.used_places, yaw=yaw)

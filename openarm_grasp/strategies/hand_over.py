@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import permutations, product
 from math import radians
 
 import numpy as np
@@ -106,7 +106,7 @@ def middle_spots(target: Detection, others: Sequence[Detection], context: GraspC
     """
     config, place = context.config.hand_over, context.config.place
     xs, ys = grid(*config.x, config.step), grid(-config.abs_y, config.abs_y, config.step)
-    ranked = [(cost, x, y) for cost, _, x, y in clear_spots(xs, ys, target, others, place)]
+    ranked = [(cost, x, y) for cost, _, x, y in clear_spots(product(xs, ys), target, others, place)]
     if not ranked:
         raise OpenArmError(
             Code.PLACE_FAILED,

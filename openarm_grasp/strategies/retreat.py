@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning import candidates
+from openarm_grasp.planning.neighbours import neighbours
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import place_targets
 from openarm_grasp.requests.states import Hand, State
@@ -89,7 +90,8 @@ async def _put_back(run: Run, grasp: Grasp) -> None:
 
 def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidates.Box, ...]:
     """What the way home keeps clear of; where a lost object lies is not known."""
-    others = candidates.obstacle_boxes(grasp.sighting.others, run.config)
+    target = candidates.target_boxes(grasp.sighting.target, grasp.candidate, run.config)
+    others = neighbours(grasp.sighting, target, run.config)
     if placed is None:
         return others
     held = candidates.held_boxes(grasp.sighting.target, grasp.candidate, run.config)

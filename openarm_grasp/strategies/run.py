@@ -55,6 +55,8 @@ class Run:
         self.findings = Findings()
         #: (3,) edges of the object when it was first observed, m.
         self.size: Array | None = None
+        #: (3,) where the object was seen last, m; None before.
+        self.seen_at: Array | None = None
         #: The object where it was when the hand was last about to go down.
         self.suspected: Detection | None = None
         #: Candidates that the planner chooses from, and the results of those that it was offered before.
@@ -186,6 +188,9 @@ class Run:
     def answer(self, code: Code, message: str, proof: Proof | Feasible | None = None) -> GraspOutcome:
         """The answer to the request."""
         x, y, z = (float(v) for v in (self.place_target.position if self.place_target else (0.0, 0.0, 0.0)))
+        seen = (
+            None if self.seen_at is None else (float(self.seen_at[0]), float(self.seen_at[1]), float(self.seen_at[2]))
+        )
         return GraspOutcome(
             code=code,
             message=message,
@@ -193,6 +198,7 @@ class Run:
             arm=self.arm,
             attempts=self.tried,
             place_position=(x, y, z),
+            object_position=seen,
             duration=(self.robot.now_ns - self.began_ns) * 1e-9,
             held=self.holding,
             options=tuple(self.options.values()),

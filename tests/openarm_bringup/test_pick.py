@@ -139,3 +139,34 @@ def test_without_a_terminal_a_plan_waits_for_the_service(
     assert client.asked["confirm"] is False
     with pytest.raises(OpenArmError, match="of one object"):
         pick.pick("red", "blue", confirm=True)
+
+
+@pytest.mark.requirement("R-17", "P-02", "P-03")
+def test_an_order_lists_what_is_left_with_place_and_reason(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    answers = [
+        GraspResult(True, Code.OK, "placed", "SUCCESS", "cup", "left", 1, (0.2, 0.3, 0.4), 9.0, (0.3, 0.0, 0.42)),
+        GraspResult(False, Code.TOO_WIDE, "190 mm", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0, (0.2, 0.1, 0.45)),
+        *[GraspResult(False, Code.UNKNOWN_OBJECT, "no more", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0)] * 2,
+    ]
+    asked: list[dict[str, Any]] = []
+
+    class Ordered(Client):
+        def pick(self, label: str, **more: Any) -> GraspResult:
+            asked.append({"label": label, **more})
+            return answers.pop(0)
+
+    monkeypatch.setattr("openarm_grasp.ros.client.GraspClient", Ordered)
+    monkeypatch.setattr(pick, "join_graph", lambda domain: None)
+    bins = tmp_path / "bins.yaml"
+    bins.write_text("bins: {tray: {x: [0.15, 0.25], y: [0.2, 0.44]}}\nrest: tray\n")
+    outcome = pick.order("anything", bins=bins)
+    assert (outcome.success, outcome.code) == (False, Code.PLACE_FAILED)
+    assert outcome.message == "PARTIAL: 1 placed, 1 left"
+    assert outcome.text == "left: anything at (0.200, 0.100) m: TOO_WIDE: 190 mm\n"
+    data = json.loads(json.dumps(outcome.data, allow_nan=False))
+    assert data["left"][0]["where"] == [0.2, 0.1]
+    assert [row["place"] for row in data["results"]] == [[0.2, 0.3, 0.4], None, None]
+    assert asked[0]["place_choices"] == ((0.2, 0.26), (0.2, 0.38))
+    assert asked[2]["exclude_near"] == ((0.2, 0.3), (0.2, 0.1))

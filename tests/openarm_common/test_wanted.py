@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.detection import Detection, kind_of
+from openarm_common.detection import Detection, gap, kind_of
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.wanted import describe, fits, select
 
@@ -114,3 +114,32 @@ def test_kinds_follow_from_measured_extents() -> None:
     assert kind_of("cylinder", (0.066, 0.066, 0.066)) == "cylinder"
     assert kind_of("sphere", (0.05, 0.05, 0.05)) == "sphere"
     assert kind_of("", (0.05, 0.05, 0.05)) == ""
+
+
+@pytest.mark.requirement("R-17", "R-18")
+def test_the_easiest_lies_under_nothing_and_has_room() -> None:
+    under = thing("red", "box", 0.30, 0.0)
+    over = replace(thing("blue", "box", 0.0, 0.0), T_base_object=se3.make(None, (0.31, 0.0, 0.48)))
+    beside = thing("green", "box", 0.30, 0.06)
+    alone = thing("", "box", 0.20, 0.3)
+    hidden = replace(thing("white", "box", 0.2, -0.3), measured=False)
+    assert select("easiest anything", (hidden, under, beside, over, alone)) == (over, alone, beside, under, hidden)
+    assert select("easiest largest thing", (under, over))[0] is over
+    assert select("easiest red", (under, over)) == (under,)
+
+
+@pytest.mark.parametrize(("x", "y", "yaw", "expected"), [
+    (0.10, 0.0, 0.0, 0.06), (0.10, 0.0, np.pi / 4.0, 0.1 - 0.02 - 0.02 * 2**0.5), (0.05, 0.05, 0.0, 0.01 * 2**0.5),
+    (0.0, 0.0, 0.3, 0.0), (0.03, 0.01, 0.0, 0.0),
+])  # fmt: skip
+def test_the_gap_between_boxes_is_that_of_their_outlines(x: float, y: float, yaw: float, expected: float) -> None:
+    a = Detection("a", 0.9, se3.make(None, (0.0, 0.0, 0.4)), np.array([0.04, 0.04, 0.04]))
+    b = Detection("b", 0.9, se3.make(se3.rot_z(yaw), (x, y, 0.5)), np.array([0.04, 0.04, 0.1]))
+    assert gap(a, b) == pytest.approx(expected, abs=1e-9)
+    assert gap(b, a) == pytest.approx(expected, abs=1e-9)
+
+
+def test_boxes_that_cross_have_no_gap() -> None:
+    a = Detection("a", 0.9, se3.make(None, (0.0, 0.0, 0.4)), np.array([0.2, 0.02, 0.04]))
+    b = Detection("b", 0.9, se3.make(None, (0.0, 0.0, 0.4)), np.array([0.02, 0.2, 0.04]))
+    assert gap(a, b) == 0.0

@@ -165,6 +165,17 @@ def test_a_full_table_has_no_free_spot():
     assert error.value.code is Code.PLACE_FAILED
 
 
+@pytest.mark.requirement("P-19", "P-03")
+def test_of_the_places_that_may_be_chosen_a_free_one_is():
+    choices = ((0.2, -0.2), (0.3, -0.2), (0.2, -0.35), (0.2, 0.3))
+    others = [box(x=0.22, y=-0.22, label="blue"), box(x=0.28, y=-0.2, label="green")]
+    spots = free_spots("right", box(x=0.2, y=0.3), others, CONFIG, SHOULDERS, choices)
+    assert [tuple(map(float, spot)) for spot in spots] == [(0.2, -0.35)]
+    with pytest.raises(OpenArmError, match="none of 2 places is free") as error:
+        free_spots("right", box(x=0.2, y=0.3), others, CONFIG, SHOULDERS, choices[:2])
+    assert error.value.code is Code.PLACE_FAILED
+
+
 @pytest.mark.parametrize("position", [(0.05, 0.0), (0.3, 0.7), (float("nan"), 0.1), (0.3, float("inf"), 0.4)])
 def test_a_place_off_the_table_is_refused(position):
     with pytest.raises(OpenArmError) as error:

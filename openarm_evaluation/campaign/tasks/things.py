@@ -94,8 +94,8 @@ def heap_task(seed: int, objects: str = "") -> Task:
     sources, rng = object_sources(objects), np.random.default_rng([seed, 43])
     chosen = _drawn(sources, int(rng.integers(_HEAP[0], _HEAP[1] + 1)), rng)
     work = robot_work()
-    y = float(rng.choice((-1.0, 1.0))) * 0.5 * sum(work.region.abs_y)
-    items = dropped(chosen, work.table, (0.5 * sum(work.region.x), y), _HEAP_HALF, rng)
+    # in the middle, where both arms come: both sides are free for what is cleared
+    items = dropped(chosen, work.table, (0.5 * sum(work.region.x), 0.0), _HEAP_HALF, rng)
     # what lies in a heap overlaps, seen from above: the scene is one of physics, and not checked as one of a file
     scene = Scene(name=f"heap_{seed}", objects=tuple(items), appearance=seed)
     return _task("heap", seed, scene)

@@ -71,13 +71,18 @@ def test_the_client_means_an_object_by_its_position_and_leaves_others(bench):
         with GraspClient() as grasp:
             results.append(grasp.pick(object_at=(0.26, 0.21), dry_run=True))
             results.append(grasp.pick("red", exclude_near=((0.26, -0.2),), dry_run=True))
+            results.append(grasp.pick("easiest thing", place_choices=((0.26, 0.22), (0.3, 0.35)), dry_run=True))
 
     thread = Thread(target=script)
     thread.start()
     bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
     thread.join()
-    intended, left = results
+    intended, left, chosen = results
     assert (intended.success, intended.label) == (True, "blue"), intended.message
+    assert intended.object_position[:2] == pytest.approx((0.26, 0.2), abs=0.03)
+    assert left.object_position is None
+    assert chosen.success, chosen.message
+    assert chosen.place_position[:2] == pytest.approx((0.3, 0.35))
     assert left.code is Code.UNKNOWN_OBJECT
     assert "must stay where they are" in left.message
 
