@@ -46,6 +46,8 @@ class MotorAxis:
         self.share = 0.0
         self.asked = False
         self._target = (math.nan, 0.0)
+        #: Where the joint was when its reading last changed, and its command then.
+        self._anchor = (math.nan, math.nan)
         self._left_s = 0.0
         self._seen_ns = 0
         damping = MitCommand(0.0, 0.0, 0.0, axis.damping, 0.0)
@@ -160,6 +162,7 @@ class MotorAxis:
         if not self.axis.grips or math.isnan(self.command[0]):
             self.command = (self.q, self.command[1])
         self._target, self._left_s = self.command, 0.0
+        self._anchor = (math.nan, math.nan)
 
     def aim(self, q: float, tau: float) -> str:
         """Go to a position with a torque until the next command comes; return why not, else nothing."""
@@ -190,7 +193,14 @@ class MotorAxis:
     def strays(self) -> str:
         """Why the joint does not follow its command; else nothing."""
         off = abs(self.q - self.command[0])
-        if self.axis.grips or not off > self._settings.tracking:
+        if self.axis.grips:
+            return ""
+        if self.q != self._anchor[0]:
+            self._anchor = (self.q, self.command[0])
+        elif abs(self.command[0] - self._anchor[1]) > self._settings.stuck:
+            way = f"while its command went {self._settings.stuck:g} rad"
+            return f"{self.axis} stays at {self.q:.4f} {way}; is its encoder dead, or the joint blocked?"
+        if not off > self._settings.tracking:
             return ""
         most = self._settings.tracking
         return f"{self.axis} is {off:.3f} rad off its command, expected {most:g} at most; is it blocked?"

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from openarm_common.errors import Code, OpenArmError
@@ -67,9 +67,30 @@ def scanned(buses: Sequence[str], wiring: Wiring) -> list[Found]:
 
 
 def _scan(bus: Bus, offset: int) -> list[Found]:
+    replies, registers = asked(bus, offset, range(1, LAST_ID + 1), _READ)
+    return [
+        _found(bus.address, motor, replies.get(motor), registers.get(motor, {}))
+        for motor in sorted({*replies, *registers})
+    ]
+
+
+def asked(
+    bus: Bus, offset: int, ids: Iterable[int], keys: Sequence[int]
+) -> tuple[dict[int, bytes], dict[int, dict[int, float]]]:
+    """Ask motors for their states and registers.
+
+    Args:
+        bus: They are on.
+        offset: Added to the ids of their replies.
+        ids: Theirs.
+        keys: Registers.
+
+    Returns:
+        Replies, and values by register, by id; of what answered.
+    """
     replies, registers = dict[int, bytes](), dict[int, dict[int, float]]()
-    ids = range(1, LAST_ID + 1)
-    questions = [[frames.refresh(i) for i in ids], *([frames.read_register(i, key) for i in ids] for key in _READ)]
+    ids = list(ids)
+    questions = [[frames.refresh(i) for i in ids], *([frames.read_register(i, key) for i in ids] for key in keys)]
     for question in questions:
         bus.send(question)
         end = time.monotonic() + _WAIT_S
@@ -82,10 +103,7 @@ def _scan(bus: Bus, offset: int) -> list[Found]:
                 elif 1 <= motor <= LAST_ID and len(data) == 8 and data[0] & 15 == motor:
                     replies[motor] = data
             time.sleep(0.002)
-    return [
-        _found(bus.address, motor, replies.get(motor), registers.get(motor, {}))
-        for motor in sorted({*replies, *registers})
-    ]
+    return replies, registers
 
 
 def _found(bus: str, motor: int, reply: bytes | None, registers: dict[int, float]) -> Found:

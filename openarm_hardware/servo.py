@@ -93,14 +93,15 @@ class Ownership:
 
     Args:
         buses: Addresses.
+        takeover_s: For so long another process, whose client has died, may take to give them up.
 
     Raises:
         OpenArmError: BUSY, when another process has one and keeps it.
     """
 
-    def __init__(self, buses: Sequence[str]) -> None:
+    def __init__(self, buses: Sequence[str], takeover_s: float = _TAKEOVER_S) -> None:
         self.sockets = list[socket.socket]()
-        end = time.monotonic() + _TAKEOVER_S
+        end = time.monotonic() + takeover_s
         for bus in sorted(set(buses)):
             name = b"\0openarm_bus_" + bus.encode()[:80]
             mine = socket.socket(socket.AF_UNIX)
@@ -126,6 +127,12 @@ class Ownership:
                 one.accept()[0].close()
                 found = True
         return found
+
+    def close(self) -> None:
+        """Give the buses up."""
+        for one in self.sockets:
+            one.close()
+        self.sockets.clear()
 
     @staticmethod
     def _ask(name: bytes) -> None:

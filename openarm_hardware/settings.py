@@ -19,6 +19,7 @@ class Settings:
         silent: A motor that leaves so many replies out in a row is lost.
         jump: Largest step of a joint's commands from one to the next, rad.
         tracking: Largest distance of a joint from its command, rad.
+        stuck: A joint whose reading stays the very same while its command moves by this has a dead encoder, rad.
         slack: By so much a joint may be beyond its limits at the start, rad.
         posture: A joint that is this much elsewhere than when it was last seen has a wrong zero, rad.
         hot: Temperature of MOSFET or rotor at which the arm holds, °C.
@@ -36,6 +37,7 @@ class Settings:
     silent: int = 3
     jump: float = 0.15
     tracking: float = 0.4
+    stuck: float = 0.1
     slack: float = 0.1
     posture: float = 0.35
     hot: int = 80

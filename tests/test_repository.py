@@ -150,7 +150,7 @@ def test_files_and_commands_that_a_page_names_exist(page: Path) -> None:
     named = re.findall(rf"`((?:{folders})/[\w./-]*)`( \(new\))?", text)
     assert [path for path, new in named if not new and not (ROOT / path).exists()] == []
     app = build_app()
-    for command, part in re.findall(r"\./openarm ([a-z]+)(?: ([a-z]+))?", text):
+    for command, part in re.findall(r"\./openarm ([a-z]+)(?: ([a-z-]+))?", text):
         assert command in app, command
         parts = [name for name in app[command] if not name.startswith("-")]
         assert not parts or not part or part in parts, f"{command} {part}"

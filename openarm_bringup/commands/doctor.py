@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from openarm_bringup.doctor import checks, graph
 from openarm_bringup.doctor.checks import Finding
@@ -54,7 +54,7 @@ def doctor(*, graph: str = "sim") -> Outcome:
     """Check versions, ROS, rendering, shared memory, ports and running graphs, with advice on each fault.
 
     Args:
-        graph: Graph whose needs the machine is checked for.
+        graph: Graph whose needs the machine is checked for; of real, also CAN interfaces, priorities and cameras.
     """
     findings = list(gather(graph))
     errors = [finding for finding in findings if finding.level == "error"]
@@ -98,7 +98,56 @@ def gather(graph: str) -> list[Finding]:
             port = 7400 + 250 * int(domain)
             findings.append(checks.check_port(port, _can_share(port)))
         findings.append(_machine())
+        if graph == "real":
+            findings += _hardware()
     return findings
+
+
+def _hardware() -> list[Finding]:
+    """Check what the motors and cameras of a real robot need."""
+    import resource
+
+    from openarm_bringup.doctor import hardware
+    from openarm_common.motors.wiring import load_wiring
+
+    try:
+        wiring = load_wiring()
+    except OpenArmError as error:
+        return [checks.error("motors", error.message, "write it as docs/hardware.md says")]
+    sys_, dev, findings = Path("/sys"), Path("/dev"), list[Finding]()
+    for address in dict.fromkeys(arm.bus for arm in wiring.arms.values()):
+        if address.startswith("python-can:"):
+            found = importlib.util.find_spec("can") is not None
+            findings.append(hardware.check_python_can(address, installed=found))
+        else:
+            name = address.partition(":")[2]
+            findings += hardware.check_can(address, sys_, _link(name), flexible=wiring.flexible)
+    limits = [resource.getrlimit(kind)[1] for kind in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK)]
+    findings.append(hardware.check_priority(limits[0], limits[1], root=os.geteuid() == 0))
+    videos = [path for path in dev.glob("video*") if os.access(path, os.R_OK | os.W_OK)]
+    library = not _failed_imports(("openarm_hardware.cameras.realsense",)) and _has_realsense()
+    return [*findings, *hardware.check_cameras(sys_, dev, [path.name for path in videos], library=library)]
+
+
+def _has_realsense() -> bool:
+    from openarm_hardware.cameras.realsense import library
+
+    try:
+        library()
+    except OpenArmError:
+        return False
+    return True
+
+
+def _link(name: str) -> Mapping[str, Any] | None:
+    """Return what `ip` says of an interface; None without it."""
+    command = ["ip", "-details", "-statistics", "-json", "link", "show", name]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+        rows = json.loads(done.stdout or "[]")
+    except (OSError, ValueError, subprocess.TimeoutExpired):
+        return None
+    return rows[0] if rows else None
 
 
 def _table(findings: list[Finding]) -> str:

@@ -3,12 +3,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import json
+import math
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from openarm_bringup.outcome import Outcome
-from openarm_common.errors import Code
+from openarm_bringup.outcome import Outcome, console
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import write_whole
+
+if TYPE_CHECKING:
+    from openarm_common.motors.axis import Axis
+    from openarm_common.robot.description import RobotDescription
+
+Emulated = Annotated[bool, Parameter(negative=())]
 
 hardware = App(name="hardware", help="Motors of a real arm on their buses, without a graph.")
 
@@ -38,3 +50,123 @@ def scan(bus: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ())
         text = f"no motor answers on {', '.join(buses)}; is the arm's power on, its bus up and at the right bitrate?"
         return Outcome(False, text, Code.NOT_READY, data)
     return Outcome(True, f"{len(found)} motors answer", data=data, text="\n".join(lines))
+
+
+@hardware.command
+def zero(*joints: str, yes: Annotated[bool, Parameter(negative=())] = False, emulated: Emulated = False) -> Outcome:
+    """Put the zeros of motors where their joints are now. Says what that changes, and asks before it does it.
+
+    Motors keep their zero without power; offsets of hardware.yaml, calibrations and stored postures are of the old one.
+
+    Args:
+        joints: Names; all of an arm: its name.
+        yes: Do not ask.
+        emulated: Motors of a simulation alone (docs/hardware.md), by ROS_DOMAIN_ID.
+    """
+    from openarm_common.motors.wiring import load_wiring
+    from openarm_hardware.upkeep import zeros
+
+    flexible = load_wiring().flexible
+    _, axes = _axes(emulated=emulated)
+    chosen = [axis for axis in axes if axis.joint in joints or axis.arm in joints]
+    known = {axis.joint for axis in axes} | {axis.arm for axis in axes}
+    if not joints or not set(joints) <= known:
+        wrong = next((joint for joint in joints if joint not in known), "")
+        text = f"no joint or arm {wrong!r}" if wrong else "name the joints, or an arm"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}; there are: {', '.join(sorted(known))}")
+    would = zeros(chosen, flexible=flexible, write=False)
+    at = {axis.joint: 0.0 - axis.offset / axis.ratio for axis in chosen}
+    lines = [f"{z.joint:<28} is at {z.before:8.4f}, will be {at[z.joint]:8.4f} where it is now" for z in would]
+    shown = console()
+    shown.print("\n".join(lines), markup=False, highlight=False)
+    if not yes:
+        shown.print("Motors keep this without power. Postures, calibrations and plans of before are wrong after it.")
+        if not sys.stdin.isatty() or input("type zero to do it: ").strip() != "zero":
+            return Outcome(False, "nothing was changed; `--yes` does it without asking", Code.CANCELLED)
+    done = zeros(chosen, flexible=flexible, write=True)
+    text = "\n".join(f"{z.joint:<28} was at {z.before:8.4f}, is at {z.after:8.4f}" for z in done)
+    forgotten = _forget_posture(emulated=emulated)
+    return Outcome(
+        True, f"zeros of {len(done)} motors were set{forgotten}", data={"zeros": list(map(vars, done))}, text=text
+    )
+
+
+@hardware.command
+def jog(joint: str, degrees: float, *, emulated: Emulated = False) -> Outcome:
+    """Move one joint there and back at 0.2 rad/s, its arm carried; then the arm sinks, and its motors are switched off.
+
+    Args:
+        joint: Its name.
+        degrees: How far, up to 30 either way.
+        emulated: As of `zero`.
+    """
+    from openarm_common.collision.self_collision import SelfCollision
+    from openarm_common.motors.wiring import load_wiring
+    from openarm_control.joints import arm_loads
+    from openarm_hardware.jog import Jog
+    from openarm_hardware.settings import Settings
+    from openarm_hardware.touch import TouchGuard
+
+    robot, axes = _axes(emulated=emulated)
+    arm = next((axis.arm for axis in axes if axis.joint == joint and not axis.grips), None)
+    if arm is None:
+        names = ", ".join(axis.joint for axis in axes if not axis.grips)
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"no joint {joint[:60]!r}; joints: {names}")
+    mine = [axis for axis in axes if axis.arm == arm]
+    guard = TouchGuard(SelfCollision(robot, [axis.joint for axis in mine]))
+    settings = Settings(flexible=load_wiring().flexible, silent=100 if emulated else Settings().silent)
+    found = Jog(mine, joint, arm_loads(robot)[arm], guard, settings).run(math.radians(degrees))
+    there, back = (math.degrees(q - found.start) for q in (found.there, found.back))
+    message = (
+        f"{joint} went {there:.2f}° there and was {back:+.2f}° off its place back; other joints moved by up to"
+        f" {math.degrees(found.others):.2f}°; {found.hottest} °C; {found.scheduling}"
+    )
+    return Outcome(True, message, data=vars(found))
+
+
+@hardware.command
+def record_gains(out: Path, *, against: Path | None = None, emulated: Emulated = False) -> Outcome:
+    """Write down what is set in the motors: gains of their own loops, ranges, protections, firmware. Only asks.
+
+    Args:
+        out: JSON file.
+        against: An earlier record; what differs is listed, as after an exchange of a motor or its firmware.
+        emulated: As of `zero`.
+    """
+    from openarm_common.motors.wiring import load_wiring
+    from openarm_common.robot.folder import robot_name
+    from openarm_hardware.upkeep import changed, gains, read_gains
+
+    before = read_gains(against) if against is not None else None
+    _, axes = _axes(emulated=emulated)
+    found = gains(axes, flexible=load_wiring().flexible)
+    write_whole(out, json.dumps({"robot": robot_name(), "motors": found}, indent=1).encode())
+    differs = changed(before, found) if before is not None else []
+    message = f"registers of {len(found)} motors are in {out}"
+    if differs:
+        return Outcome(
+            False, f"{message}; {len(differs)} differ from {against}", Code.CONFIG_INVALID, text="\n".join(differs)
+        )
+    return Outcome(True, message, data={"motors": found})
+
+
+def _axes(*, emulated: bool) -> tuple[RobotDescription, tuple[Axis, ...]]:
+    """Return the robot and its motors, those of a simulation by the ROS domain."""
+    from openarm_common.motors.bus import emulated_buses
+    from openarm_common.motors.wiring import axes_of, load_wiring
+    from openarm_common.robot.description import RobotDescription
+
+    robot = RobotDescription.load()
+    buses = emulated_buses(int(os.environ.get("ROS_DOMAIN_ID") or 0), robot.arm_names) if emulated else None
+    return robot, axes_of(load_wiring(), robot, buses)
+
+
+def _forget_posture(*, emulated: bool) -> str:
+    """Forget where the joints were last seen; return what to say of it."""
+    from openarm_hardware.posture import LastPosture
+
+    path = LastPosture("", "_emulated" if emulated else "").path
+    if not path.is_file():
+        return ""
+    path.unlink()
+    return f"; where the joints were last seen ({path}) was forgotten"

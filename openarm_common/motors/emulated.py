@@ -19,6 +19,25 @@ from openarm_common.motors.frames import ControlMode, Feedback, MitCommand, PosF
 
 #: Gains of the loops of POS_FORCE: rad/s by rad, and N m by rad/s.
 _POSITION_GAIN, _SPEED_GAIN = 20.0, 0.3
+#: Registers that the suite reads and does not use, as numbers that tell them apart.
+_OF_FACTORY: dict[int, float] = {
+    Register.UV_VALUE: 15.0,
+    Register.KT_VALUE: 0.945,
+    Register.OT_VALUE: 100.0,
+    Register.OC_VALUE: 0.8,
+    Register.ACC: 20.0,
+    Register.DEC: -20.0,
+    Register.MAX_SPD: 30.0,
+    Register.GR: 10.0,
+    Register.I_BW: 1000.0,
+    Register.KP_ASR: 0.00372,
+    Register.KI_ASR: 0.003,
+    Register.KP_APR: 50.0,
+    Register.KI_APR: 0.0,
+    Register.OV_VALUE: 32.0,
+    Register.CAN_BR: 4,
+    Register.SUB_VER: 1,
+}
 #: Names of faults, with what their value is.
 FAULTS = {
     "silent": "the motor of `joint` takes frames and answers none",
@@ -63,6 +82,7 @@ class EmulatedMotor:
             Register.PMAX: self.kind.q_max,
             Register.VMAX: self.kind.dq_max,
             Register.TMAX: self.kind.tau_max,
+            **_OF_FACTORY,
         }
         self.command: MitCommand | PosForceCommand | None = None
         self.commands = 0

@@ -62,11 +62,15 @@ class ControlMode(IntEnum):
 
 
 class Register(IntEnum):
-    """Registers that the suite reads or writes."""
+    """Registers that the suite reads or writes; ASR and APR are the motor's own loops of speed and position."""
 
     UV_VALUE = 0
+    KT_VALUE = 1
     OT_VALUE = 2
     OC_VALUE = 3
+    ACC = 4
+    DEC = 5
+    MAX_SPD = 6
     MST_ID = 7
     ESC_ID = 8
     TIMEOUT = 9
@@ -76,6 +80,11 @@ class Register(IntEnum):
     PMAX = 21
     VMAX = 22
     TMAX = 23
+    I_BW = 24
+    KP_ASR = 25
+    KI_ASR = 26
+    KP_APR = 27
+    KI_APR = 28
     OV_VALUE = 29
     CAN_BR = 35
     SUB_VER = 36

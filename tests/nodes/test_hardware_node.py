@@ -70,6 +70,7 @@ def bench(ros, tmp_path: Path) -> Bench:
     return Bench(ros, tmp_path)
 
 
+@pytest.mark.requirement("A-25", "B-55", "P-22")
 def test_the_arms_move_and_the_hand_closes_as_on_the_bridge(bench: Bench) -> None:
     goal = bench.goal((0.5, START), (2.5, [q + 0.6 * (i == 1) for i, q in enumerate(START)]))
     _, result = bench.follow(goal)
@@ -91,6 +92,7 @@ def test_the_arms_move_and_the_hand_closes_as_on_the_bridge(bench: Bench) -> Non
     assert (Path(bench.hardware.config.calibrations) / "last_posture_emulated.json").is_file()
 
 
+@pytest.mark.requirement("R-08", "R-10")
 def test_a_fault_of_a_motor_ends_the_goal_by_name_and_is_reset_when_it_is_gone(bench: Bench) -> None:
     goal = bench.goal((0.5, START), (6.0, [q + 0.6 * (i == 1) for i, q in enumerate(START)]))
     _, result = bench.follow(goal)
@@ -112,6 +114,7 @@ def test_a_fault_of_a_motor_ends_the_goal_by_name_and_is_reset_when_it_is_gone(b
     assert bench.ros.result(result, 20.0).result.error_code == 0
 
 
+@pytest.mark.requirement("R-08")
 def test_the_emergency_stop_holds_the_motors_until_reset(bench: Bench) -> None:
     goal = bench.goal((0.5, START), (6.0, [q + 0.8 * (i == 1) for i, q in enumerate(START)]))
     _, result = bench.follow(goal)

@@ -191,3 +191,32 @@ def test_drawings_show_who_gives_what_to_whom(tmp_path: Path) -> None:
     assert 'bridge -- "/joint_states" --> arm' in mermaid(graph)
     assert "/joint_states → arm" in text(graph)
     assert "after bridge, arm" in text(graph)
+
+
+REAL = """
+extends: real
+nodes:
+  openarm_hardware: {params: {motors: {hot: 70}, emulated: false}}
+"""
+
+
+@pytest.mark.requirement("R-10", "A-25")
+def test_emulation_puts_a_simulation_in_place_of_motors_and_cameras_and_keeps_what_a_file_says(tmp_path: Path) -> None:
+    graph = load_graph(write(tmp_path, REAL), emulate=True)
+    assert not [name for name in graph.nodes if name.endswith("_camera")]
+    assert graph.node("mujoco_bridge").params["controllers"] == "motors"
+    params = graph.node("openarm_hardware").params
+    assert (params["emulated"], params["motors.hot"]) == (True, 70)
+    assert (graph.scene, graph.mount_seed) == ("demo", 1)
+    real = load_graph(write(tmp_path, REAL))
+    assert "mujoco_bridge" not in real.nodes
+    assert [name for name in real.nodes if name.endswith("_camera")]
+    assert real.node("openarm_hardware").params["emulated"] is False
+    others = graph.nodes.keys() - {"mujoco_bridge"}
+    assert others == {name for name in real.nodes if not name.endswith("_camera")}
+
+
+def test_a_graph_without_an_emulation_is_refused_one(tmp_path: Path) -> None:
+    with pytest.raises(OpenArmError, match=r"has no `emulate`.*real") as refused:
+        load_graph(write(tmp_path, BASE), emulate=True)
+    assert refused.value.code is Code.INVALID_ARGUMENT

@@ -166,6 +166,25 @@ def test_a_frozen_encoder_is_found_when_the_arm_moves() -> None:
         (q + (0.0 if a.grips else 0.5 * (bench.now_ns - since) * 1e-9), 1.0 if a.grips else 0.0)
         for q, a in zip(start, bench.axes, strict=True)
     ]
+    bench.until([Phase.HELD, Phase.HELD], 0.3)
+    assert "one_4" in bench.machine.text
+    assert "is its encoder dead" in bench.machine.text
+
+
+def test_a_joint_that_is_blocked_is_found_by_its_distance_from_the_command() -> None:
+    bench = Bench(weight=0.0).up()
+    since, start = bench.now_ns, [s.command for s in bench.machine.motors()]
+    blocked = bench.motors[3]
+    stop = blocked.q
+
+    def push() -> list[tuple[float, float]]:
+        blocked.q, blocked.dq = stop + 1e-3 * math.sin(0.1 * bench.commands), 0.0  # the encoder lives
+        return [
+            (q + (0.0 if a.grips else 0.5 * (bench.now_ns - since) * 1e-9), 1.0 if a.grips else 0.0)
+            for q, a in zip(start, bench.axes, strict=True)
+        ]
+
+    bench.client = push
     bench.until([Phase.HELD, Phase.HELD], 1.5)
     assert "one_4" in bench.machine.text
     assert "off its command" in bench.machine.text

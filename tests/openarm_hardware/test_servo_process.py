@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.motors.axis import Axis
 from openarm_common.motors.wiring import load_wiring
 from openarm_hardware.arm import Phase
 from openarm_hardware.client import ServoProcess
@@ -36,8 +37,8 @@ GUARD_S = 20.0
 class Rig:
     """Emulated motors, and servos before them."""
 
-    def __init__(self, folder: Path) -> None:
-        self.axes = made_axes((f"unix:{folder}/a", f"unix:{folder}/b"))
+    def __init__(self, folder: Path, axes: tuple[Axis, ...] = ()) -> None:
+        self.axes = axes or made_axes((f"unix:{folder}/a", f"unix:{folder}/b"))
         self._emulator = subprocess.Popen(
             [sys.executable, "-m", "openarm_hardware.emulator"],
             stdin=subprocess.PIPE,

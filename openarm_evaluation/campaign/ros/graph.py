@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 from openarm_interfaces.srv import SaveRecording
+from std_srvs.srv import Empty
 
 from openarm_bringup.supervision import environment
 from openarm_bringup.supervision.graph import load_graph
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 
 #: Longest wait for a recording, s: a busy machine takes a while.
 _WRITTEN_S = 60.0
+#: So often an arm may try to get home.
+_HOME_TRIES = 4
 #: Sets without fault injection, in which a request does not depend on the outcome of those before.
 GRAPH_SETS = ("nominal", "objects", "handover", "push", "pairs", "pairs_in_turn")
 
@@ -116,11 +119,18 @@ def bring_home(client: GraspClient) -> None:
     from openarm_bringup.ros.stop_client import release
     from openarm_motion.ros.client import MotionClient
 
+    arms = RobotDescription.load().arm_names
     release(client)
+    for arm in arms:
+        client.release(arm)
     with MotionClient() as motion:
-        for arm in RobotDescription.load().arm_names:
-            client.release(arm)
-            motion.move_to_named(arm, "home", hand_empty=True).raise_for_code()
+        for arm in arms:
+            for left in range(_HOME_TRIES - 1, -1, -1):  # what fell out of a hand is on the map for a while
+                client.call(Empty, "/octomap/reset", Empty.Request())
+                found = motion.move_to_named(arm, "home", hand_empty=True)
+                if found.success or not left:
+                    found.raise_for_code()
+                    break
 
 
 def keep_recording(client: GraspClient, row: Row, folder: Path, timeout: float = _WRITTEN_S) -> None:
