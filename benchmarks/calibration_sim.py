@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import tempfile
 import time
 from pathlib import Path
 
@@ -66,9 +65,8 @@ def measure(name: str, seed: int) -> dict[int, tuple[float, float, float]]:
     found: dict[int, tuple[float, float, float]] = {}
     text: list[str] = []
     px = math.nan
-    with tempfile.TemporaryDirectory() as folder:
-        bench = Bench(camera, seed, Path(folder))
-        bench.fill(np.random.default_rng(seed), COUNTS[0])
+    bench = Bench(camera, seed)
+    bench.fill(np.random.default_rng(seed), COUNTS[0])
     for count in COUNTS:
         while len(bench.samples) > count:
             bench.samples.remove("")

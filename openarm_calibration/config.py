@@ -57,6 +57,9 @@ class AutoConfig(Config):
     on_hand: PlaceConfig = Field(
         default_factory=PlaceConfig, description="board of a fixed camera, frame of the carrier"
     )
+    as_in_scene: bool = Field(
+        default=False, description="a board whose place is not given is where the scene calibration_CAMERA has it"
+    )
     search: SearchConfig = Field(default_factory=SearchConfig, description="for the next pose")
 
 

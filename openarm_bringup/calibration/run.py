@@ -17,6 +17,7 @@ from openarm_common.camera.cameras import uncertain_cameras
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.boards import CALIBRATION
 
 if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
@@ -32,7 +33,7 @@ class CalibrationOptions:
     """What to calibrate.
 
     Args:
-        cameras: Names; each needs a scene `calibration_<camera>`.
+        cameras: Names; each in its scene `calibration_<camera>`.
         mount_seed: Of the true mounts, or "none"; None is the graph's.
         poses: Samples a camera at most; 0 is the node's parameter.
         enough: Predicted errors that end it, m and rad; 0 is the node's parameter.
@@ -81,7 +82,7 @@ class CalibrationRun:
 
 def scene_of(camera: str) -> str:
     """Return the name of the scene in which a camera is calibrated."""
-    return f"calibration_{camera}"
+    return f"{CALIBRATION}_{camera}"
 
 
 def chosen_cameras(names: Sequence[str]) -> tuple[str, ...]:

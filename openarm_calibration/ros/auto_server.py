@@ -25,6 +25,7 @@ from openarm_common.asked_files import file_to_write
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import ActionClient, ActionServer, check_alive
 from openarm_common.ros.convert import matrix_to_pose, vector
+from openarm_common.scene.boards import board_of
 from openarm_common.types import Array
 
 if TYPE_CHECKING:
@@ -113,6 +114,8 @@ class _Run:
         self._enough_r = self._goal.sigma_rotation or config.sigma_rotation
         fixed = head.setup == "to_hand"
         place = (config.on_hand if fixed else config.on_table).pose
+        if place is None and config.as_in_scene:
+            place = board_of(node.camera, node.description)[1]
         self._fixed = fixed
         self._search = PoseSearch(node.description, node.camera.T_parent_optical, place, config.search)
 

@@ -344,7 +344,7 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
 
     Args:
         source: Name of a file in `models/scenes` or in `scenes` of the robot's folder, which has precedence, a path
-            ending in .yaml, or "random".
+            ending in .yaml, "random", or `calibration_CAMERA`: the board for a camera.
         seed: Of a random scene.
 
     Raises:
@@ -357,7 +357,12 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
         own, common = (folder / f"{source}.yaml" for folder in _folders())
         path = own if is_file(own) else common
     if not is_file(path):
-        names = sorted({file.stem for folder in _folders() for file in folder.glob("*.yaml")})
+        from openarm_common.scene.boards import board_scene, board_scenes
+
+        boards = board_scenes()
+        if camera := boards.get(str(source)):
+            return parse_scene({"name": str(source), **board_scene(camera)}, str(source))
+        names = sorted({*boards, *(file.stem for folder in _folders() for file in folder.glob("*.yaml"))})
         raise OpenArmError(
             Code.SCENE_INVALID,
             f"no scene {brief(str(source))}; scenes: {', '.join([*names, 'random'])}, or the path of a YAML",

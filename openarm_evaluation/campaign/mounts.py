@@ -8,7 +8,6 @@ as wrong as its joint zeros. World = base frame, m.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ import mujoco
 import numpy as np
 
 from openarm_calibration.board.board import CircleGrid
-from openarm_calibration.board.board_files import write_board
 from openarm_calibration.board.detect import BoardDetection, detect
 from openarm_calibration.handeye.offline import Result, calibrate
 from openarm_calibration.sampling.gate import Matched
@@ -29,7 +27,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, load_cameras, uncertain_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.folder import ArmParts, robot_work
+from openarm_common.scene.boards import CALIBRATION
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Array
 from openarm_evaluation.campaign.robot import shared_renderer
@@ -38,12 +36,6 @@ from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
 from openarm_sim_bridge.world.model import build_spec
 from openarm_sim_bridge.world.world import Snapshot, start_qpos
 
-#: The board between the fingers, for a fixed camera: so far ahead of the tool centre point, m.
-_AHEAD, _HELD = 0.19, se3.rotation_from_z_y((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-#: And lying on the table, for one on the hand: before the far end of the region, to the side of its arm, m.
-_BEFORE, _ASIDE, _ABOVE = 0.03, 0.2, 0.005
-#: An arm whose shoulder is nearer to the middle is of neither side, m.
-_MIDDLE = 0.02
 _SAMPLES = 15
 _SPREAD = 0.4  # rad, of each joint around the middle of the postures
 _MAX_MISSED = 200
@@ -78,10 +70,9 @@ def with_mounts(
 
 def calibrated(camera: CameraConfig, mount_seed: int, zeros: Mapping[str, float] | None = None) -> Result:
     """Calibrate a camera at true mounts of a seed; `zeros` as for `Bench`."""
-    with tempfile.TemporaryDirectory() as name:
-        bench = Bench(camera, mount_seed, Path(name), zeros)
-        bench.fill(np.random.default_rng(mount_seed))
-        return calibrate(bench.samples)
+    bench = Bench(camera, mount_seed, zeros)
+    bench.fill(np.random.default_rng(mount_seed))
+    return calibrate(bench.samples)
 
 
 class Bench:
@@ -90,30 +81,22 @@ class Bench:
     Args:
         camera: Which.
         seed: Of the true mounts.
-        folder: For the board's files.
         zeros: What is added to true joint positions, rad by name.
     """
 
-    def __init__(self, camera: CameraConfig, seed: int, folder: Path, zeros: Mapping[str, float] | None = None) -> None:
+    def __init__(self, camera: CameraConfig, seed: int, zeros: Mapping[str, float] | None = None) -> None:
         self._zeros = zeros or {}
         self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load()
-        moves = self._description.arm_of(camera.parent)
-        self._fixed = not moves
-        holder = self._description.arm(self._description.arm_names[-1])
-        self._carrier = camera.parent if moves else holder.flange
+        scene = load_scene(f"{CALIBRATION}_{camera.name}")
+        board = scene.fixtures[0]
+        self._fixed = bool(board.link)
+        self._carrier = board.link or camera.parent
+        self._T_carrier_board = board.T_link_fixture
         self._home: dict[str, float] = {}
         for arm in self._description.arm_names:
             hand = self._description.hand(arm)  # fingers that are open hide less from a camera behind them
             self._home |= self._description.group_state(f"{arm}_arm", "home") | {hand.joint: hand.opened}
-        carrier = self._carrier if self._fixed else ""
-        self._T_carrier_board = self._in_hand(holder) if self._fixed else self._on_table(moves)
-        write_board(self._board, folder / "board.xml")
-        spec = build_spec(self._description, load_scene("empty"), load_cameras(), seed)
-        child = mujoco.MjSpec.from_file(str(folder / "board.xml"))
-        parent = spec.body(carrier) if carrier else spec.worldbody
-        quat = np.roll(se3.quat_xyzw_from_matrix(self._T_carrier_board[:3, :3]), 1)
-        frame = parent.add_frame(pos=self._T_carrier_board[:3, 3], quat=quat)
-        frame.attach_body(child.body("calibration_board"), "board_", "")
+        spec = build_spec(self._description, scene, load_cameras(), seed)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._picture = np.empty((camera.height, camera.width, 3), np.uint8)
@@ -129,23 +112,6 @@ class Bench:
             mount_seed=seed,
         )
         self.samples = SampleSet(head, self._description)
-
-    def _in_hand(self, arm: ArmParts) -> Array:
-        """Where an arm holds the board, frame of its flange, (4, 4)."""
-        zero = dict.fromkeys(self._description.joints, 0.0)
-        T_root_flange, T_root_tcp = (self._description.link_pose(link, zero) for link in (arm.flange, arm.tcp))
-        T_flange_tcp = se3.inverse(T_root_flange) @ T_root_tcp
-        T_flange_board = T_flange_tcp @ se3.make(_HELD, (0.0, 0.0, _AHEAD))
-        return se3.make(T_flange_board[:3, :3], T_flange_board[:3, 3].round(3))
-
-    def _on_table(self, arm: str) -> Array:
-        """Where the board lies for the camera on the hand of an arm, (4, 4)."""
-        work = robot_work()
-        anyhow = dict.fromkeys(self._description.joints, 0.0)  # a lift does not change it
-        shoulder = float(self._description.link_pose(self._description.arm(arm).base, anyhow)[1, 3])
-        y = np.sign(shoulder) * _ASIDE if abs(shoulder) > _MIDDLE else 0.0
-        place = (round(work.region.x[1] - _BEFORE, 3), y, round(work.table.top_z + _ABOVE, 3))
-        return se3.make(se3.rotation_from_z_y((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)), place)
 
     def fill(self, rng: np.random.Generator, count: int = _SAMPLES) -> None:
         """Take `count` samples.

@@ -97,9 +97,10 @@ def test_a_scene_in_the_folder_of_the_robot_goes_before_one_of_all_robots(nearer
     common = load_scene("empty")
     monkeypatch.setattr(scene, "models_dir", folder.models_dir)
     own = folder.models_dir() / "robots" / "nearer" / "scenes"
+    own.mkdir()
     (own / "empty.yaml").write_text("table: {top_z: 0.5}")
     assert (load_scene("empty").table.top_z, common.table.top_z) == (0.5, 0.45)
-    with pytest.raises(OpenArmError, match="calibration_overhead, calibration_wrist, empty, random"):
+    with pytest.raises(OpenArmError, match="calibration, calibration_overhead, calibration_wrist, empty, random"):
         load_scene("demo")
 
 

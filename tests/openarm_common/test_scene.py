@@ -42,7 +42,7 @@ def refused(data: dict[str, Any]) -> str:
 
 def test_every_scene_of_the_suite_is_valid() -> None:
     files = sorted([*(models_dir() / "scenes").glob("*.yaml"), *models_dir().glob("robots/openarm_v1/scenes/*.yaml")])
-    assert {"demo", "empty", "calibration_wrist"} <= {file.stem for file in files}
+    assert {"demo", "empty"} <= {file.stem for file in files}
     for file in files:
         assert load_scene(file.stem).name == file.stem
         assert load_scene(file) == load_scene(file.stem)

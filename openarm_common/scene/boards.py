@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a calibration board is for each camera of a robot; it follows from the robot's folder. Base frame = world, m.
+
+For a fixed camera the last arm holds it ahead of its fingers; for one that moves it lies on the table.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from openarm_common import se3
+from openarm_common.camera.cameras import CameraConfig, load_cameras, near_camera, table_camera, uncertain_cameras
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import robot_work
+from openarm_common.types import Array
+
+#: Begins the name of the scene with the board of a camera.
+CALIBRATION = "calibration"
+_MODEL = "boards/circles_4x11.xml"
+#: The board in the hand, so far ahead of the tool centre point, m.
+_AHEAD, _HELD = 0.19, se3.rotation_from_z_y((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+#: And on the table: before the far end of the region, to the side of the arm, m.
+_BEFORE, _ASIDE, _ABOVE = 0.03, 0.2, 0.005
+_LYING = ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))
+#: An arm whose shoulder is nearer to the middle is of neither side, m.
+_MIDDLE = 0.02
+
+
+def board_scenes() -> dict[str, CameraConfig]:
+    """Return the cameras of this process's robot by the names of the scenes with a board for them.
+
+    `calibration` is for the camera that is calibrated when none is named.
+    """
+    cameras = load_cameras()
+    scenes = {f"{CALIBRATION}_{name}": cameras[name] for name in uncertain_cameras()}
+    first = near_camera() or table_camera()
+    return scenes | ({CALIBRATION: cameras[first]} if first in uncertain_cameras() else {})
+
+
+def board_of(camera: CameraConfig, description: RobotDescription) -> tuple[str, Array]:
+    """Return the link that carries the board for a camera ("": the world), and its pose in the frame of it, (4, 4)."""
+    anyhow = dict.fromkeys(description.joints, 0.0)
+    moves = description.arm_of(camera.parent)
+    if not moves:
+        arm = description.arm(description.arm_names[-1])
+        T_flange_tcp = se3.inverse(description.link_pose(arm.flange, anyhow)) @ description.link_pose(arm.tcp, anyhow)
+        T_flange_board = T_flange_tcp @ se3.make(_HELD, (0.0, 0.0, _AHEAD))
+        return arm.flange, se3.make(T_flange_board[:3, :3], T_flange_board[:3, 3].round(3))
+    work = robot_work()
+    shoulder = float(description.link_pose(description.arm(moves).base, anyhow)[1, 3])
+    y = float(np.sign(shoulder)) * _ASIDE if abs(shoulder) > _MIDDLE else 0.0
+    place = (round(work.region.x[1] - _BEFORE, 3), y, round(work.table.top_z + _ABOVE, 3))
+    return "", se3.make(se3.rotation_from_z_y(*_LYING), place)
+
+
+def board_scene(camera: CameraConfig) -> dict[str, Any]:
+    """Return the scene with the board for a camera, as a file would say it."""
+    link, T_link_board = board_of(camera, RobotDescription.load())
+    axes = {name: T_link_board[:3, k].tolist() for name, k in (("position", 3), ("z_axis", 2), ("y_axis", 1))}
+    return {"objects": [], "fixtures": [{"name": "board", "model": _MODEL, "link": link, **axes}]}
