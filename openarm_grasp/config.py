@@ -237,6 +237,12 @@ class PushConfig(Config):
     )
 
 
+class HeightConfig(Config):
+    """How a robot on a lift searches for a height from which it can grasp."""
+
+    step: float = Field(default=0.05, ge=0.01, le=0.5, description="between two heights that are tried, m")
+
+
 class LimitsConfig(Config):
     """When to stop trying and when to stop waiting."""
 
@@ -329,6 +335,7 @@ class GraspConfig(Config):
     place: PlaceConfig = Field(default_factory=PlaceConfig)
     hand_over: HandOverConfig = Field(default_factory=HandOverConfig)
     push: PushConfig = PushConfig()
+    height: HeightConfig = HeightConfig()
     limits: LimitsConfig = LimitsConfig()
     budget: BudgetConfig = BudgetConfig()
     drift: DriftConfig = DriftConfig()

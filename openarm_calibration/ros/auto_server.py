@@ -218,7 +218,9 @@ class _Run:
         """
         if not await wait_until(self._node, self._mover.server_is_ready, _ANSWER):
             raise OpenArmError(Code.NOT_READY, "no action /motion/move: is the graph up (openarm up calibrate)?")
-        goal = MoveArm.Goal(arm=self._arm, kind=MoveArm.Goal.JOINTS, joint_positions=q.tolist())
+        moved, names = self._node.description.arm_joints(self._arm), self._node.samples.joint_names
+        positions = [position for name, position in zip(names, q.tolist(), strict=True) if name in moved]
+        goal = MoveArm.Goal(arm=self._arm, kind=MoveArm.Goal.JOINTS, joint_positions=positions)
         goal.velocity_scale = scale
         self._surround(goal)
         died = self._mover.watch()
@@ -261,7 +263,7 @@ class _Run:
         T_carrier_box = Z @ se3.make(None, (0.0, 0.0, thick / 2.0))  # the board's z points into it
         if not self._fixed:
             box.pose = matrix_to_pose(T_carrier_box)
-            goal.obstacles = [box]
+            goal.obstacles, goal.hand_empty = [box], True  # of the camera before, the board was in the hand
             return
         description = self._node.description
         tool, carrier = description.tcp_link(self._arm), self._node.samples.head.carrier

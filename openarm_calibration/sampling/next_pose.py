@@ -235,6 +235,10 @@ class PoseSearch:
         config, rng = self._config, self._rng
         lower, upper = self._description.limits(samples.joint_names)
         low, high = lower + config.joint_margin, upper - config.joint_margin
+        lift = self._description.lift
+        if lift is not None and lift.joint in samples.joint_names:  # it stays where it is
+            k = samples.joint_names.index(lift.joint)
+            low[k] = high[k] = state[lift.joint]
         margin = config.margin if self.belief.solved else _RULER
         pool, refused = list(self._known), np.array(self._refused)
         wanted = config.candidates if pool else _ENOUGH

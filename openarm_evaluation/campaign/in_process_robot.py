@@ -23,6 +23,7 @@ from openarm_motion.collision.solids import Box
 from openarm_motion.planning.approach import ApproachRequest, Target
 from openarm_motion.service.requests import (
     ExecuteRequest,
+    JointGoal,
     LineGoal,
     MotionAnswer,
     MoveRequest,
@@ -156,11 +157,13 @@ class InProcessRobot:
         Raises:
             OpenArmError: With the planner's code.
         """
-        after = request.after if isinstance(request, PlanPlace) else None
+        start = np.array(request.start if isinstance(request, PlanGrasp) else ())
+        if isinstance(request, PlanPlace) and isinstance(request.after, Trajectory):
+            start = request.after.q[-1]
         asked = PlanApproachRequest(
             request.arm,
             approach_of(request),
-            after.q[-1] if isinstance(after, Trajectory) else np.zeros(0),
+            start,
             self._config.velocity_scale,
             boxes_of(request.ignore_regions),
         )
@@ -197,8 +200,8 @@ class InProcessRobot:
         await self._moved(lambda stopped: self.robot.motion.execute(request, stopped), what, guard)
 
     async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[GraspBox] = ()) -> None:
-        """Move an arm on a free path to a named posture, or its TCP on a straight line to a pose."""
-        goal = NamedGoal(to) if isinstance(to, str) else LineGoal(to)
+        """Move an arm on a free path to a named posture or joint positions, or its TCP on a straight line to a pose."""
+        goal = NamedGoal(to) if isinstance(to, str) else JointGoal(to) if to.ndim == 1 else LineGoal(to)
         request = MoveRequest(
             arm,
             goal,

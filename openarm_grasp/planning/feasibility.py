@@ -24,6 +24,7 @@ from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import other_grasps, place_targets
 
 if TYPE_CHECKING:
+    from openarm_grasp.robot.interface import Planned
     from openarm_grasp.robot.skills import Skills
 
 
@@ -69,6 +70,14 @@ class FeasibilityCheck:
                 raise
             return error
         return None
+
+    async def grasp(self, arm: str, found: Sighting, *, at_height: float | None = None) -> Planned:
+        """Plan a grasp; `at_height`: with the lift at another position, m.
+
+        Raises:
+            OpenArmError: One of `NO_WAY`; what the robot raises.
+        """
+        return await self._robot.plan_grasp(arm, self._offered(arm, found), found, at_height=at_height)
 
     def _offered(self, arm: str, found: Sighting) -> tuple[GraspCandidate, ...]:
         shoulder = self._context.shoulders.get(arm, (0.0, 0.0))

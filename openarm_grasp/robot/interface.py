@@ -29,6 +29,7 @@ class PlanGrasp:
     Attributes:
         target: The object, as one box or several, base frame; the fingers may touch it, and it goes with the hand.
         ignore_regions: Where the object will not stand any more then: the map still shows it there.
+        start: Joints that it starts from: of the lift, then of the arm, rad and m; empty: the present ones.
     """
 
     arm: str
@@ -36,6 +37,7 @@ class PlanGrasp:
     obstacles: tuple[Box, ...]
     target: tuple[Box, ...]
     ignore_regions: tuple[Box, ...] = ()
+    start: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,10 @@ class RobotInterface(Protocol):
         """Follow a planned trajectory."""
 
     async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = ()) -> None:
-        """Move an arm on a free path to a named posture, or its TCP on a straight line to a pose (4, 4)."""
+        """Move an arm on a free path to a named posture, or its TCP on a straight line to a pose (4, 4).
+
+        The lift goes to a position (1,), m.
+        """
 
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Move the fingers with at most `effort` N (0: any); whether they arrived or push against something."""

@@ -15,6 +15,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.lift import LIFT
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
@@ -125,7 +126,13 @@ class Skills:
         return await self.robot.plan(request)
 
     async def plan_grasp(
-        self, arm: str, ways: Sequence[GraspCandidate], found: Sighting, now: Sighting | None = None
+        self,
+        arm: str,
+        ways: Sequence[GraspCandidate],
+        found: Sighting,
+        now: Sighting | None = None,
+        *,
+        at_height: float | None = None,
     ) -> Planned:
         """Plan one of several grasps.
 
@@ -134,12 +141,16 @@ class Skills:
             ways: The candidates.
             found: The object and its neighbours.
             now: The object where it stands until then, when that is elsewhere: the map shows it there.
+            at_height: Position that the lift has then, m; None: where it is.
         """
-        config = self._config
+        config, start = self._config, tuple[float, ...]()
+        if at_height is not None:
+            _, q = self.robot.states.latest()
+            start = (at_height, *(q[name] for name in self.description.arm_joints(arm)))
         target = target_boxes(found.target, ways[0] if ways else None, config)
         obstacles = neighbours(found, target, config)
         gone = () if now is None else (target_box(now.target, config),)
-        return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone))
+        return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone, start))
 
     async def plan_place(
         self,
@@ -233,6 +244,16 @@ class Skills:
         """Move the TCP to a pose on a straight line."""
         self.robot.check()
         await self.robot.move(arm, T_base_tcp, f"{arm} arm: {what}")
+
+    async def move_lift(self, position: float) -> None:
+        """Move the lift that carries the arms, while they keep their postures, m."""
+        self.robot.check()
+        await self.robot.move(LIFT, np.array([position]), "lift")
+
+    def lift_position(self) -> float:
+        """Position of the lift, m; 0 without one."""
+        lift = self.description.lift
+        return self.robot.states.latest()[1][lift.joint] if lift is not None else 0.0
 
     async def go_home(
         self, arms: Sequence[str], obstacles: Sequence[Box] = (), *, back_off_below: float = float("-inf")

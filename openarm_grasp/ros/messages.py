@@ -220,6 +220,7 @@ def plan_goal(request: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanAppr
         goal.targets = _targets(request.candidates)
         goal.obstacles = [box_to_msg(box) for box in (*request.obstacles, *request.target)]
         goal.touchable, goal.attached_after_approach = [box.id for box in request.target], True
+        goal.start = list(request.start)
         return goal
     goal.targets = _targets(request.targets)
     goal.obstacles = [box_to_msg(box) for box in request.obstacles]
@@ -326,12 +327,12 @@ def reach_from_msg(arm: str, answer: ComputeIK.Response, T_base_tcp: Array) -> d
 def move_goal(
     arm: str, frame: str, to: str | Array, obstacles: Sequence[Box], velocity_scale: float, max_start_delay: float
 ) -> MoveArm.Goal:
-    """A free path to a named posture, or a straight line of the TCP to a pose.
+    """A free path to a named posture, or to joint positions, or a straight line of the TCP to a pose.
 
     Args:
         arm: Which.
         frame: Base frame.
-        to: Name of the posture, or the pose (4, 4), base frame.
+        to: Name of the posture, joint positions (n,), or the pose (4, 4), base frame.
         obstacles: Boxes to keep clear of, base frame.
         velocity_scale: Of the motion limits; 0: the planner's default.
         max_start_delay: Longest start delay until the other arm leaves clearance, s.
@@ -345,6 +346,9 @@ def move_goal(
     )
     if isinstance(to, str):
         goal.kind, goal.named = MoveArm.Goal.NAMED, to
+        return goal
+    if to.ndim == 1:
+        goal.kind, goal.joint_positions = MoveArm.Goal.JOINTS, to.tolist()
         return goal
     goal.kind, goal.pose.header.frame_id = MoveArm.Goal.LINEAR, frame
     goal.pose.pose = matrix_to_pose(to)

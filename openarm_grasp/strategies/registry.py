@@ -18,6 +18,7 @@ from openarm_grasp.requests.request import GraspOutcome, PairOutcome
 from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.direct import direct
 from openarm_grasp.strategies.hand_over import hand_over
+from openarm_grasp.strategies.height import height
 from openarm_grasp.strategies.in_hand import take_up
 from openarm_grasp.strategies.pair import ENDS, Pair, in_turn, simultaneous
 from openarm_grasp.strategies.push import push
@@ -27,6 +28,7 @@ Strategy = Callable[[Task], Awaitable[GraspOutcome | None]]
 #: For one object.
 STRATEGIES: dict[str, Strategy] = {
     "direct": direct,
+    "height": height,
     "push": push,
     "hand_over": hand_over,
 }

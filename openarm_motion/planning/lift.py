@@ -15,6 +15,7 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.lift import LiftParts
+from openarm_common.robot.urdf import Joint
 from openarm_motion.collision.exact import CollisionContext, CollisionScene
 from openarm_motion.collision.robot import CollisionRobot
 from openarm_motion.collision.solids import Box
@@ -47,11 +48,11 @@ class LiftedArms(Mapping[str, Arm]):
         self.description, self.lift = description, lift
 
         @lru_cache(maxsize=_KEPT)
-        def at(steps: int) -> Mapping[str, Arm]:
+        def made(steps: int) -> Mapping[str, Arm]:
             return make(description.with_fixed(lift.joint, steps * _STEP))
 
-        self._at = at
-        self._height, self._arms = 0.0, at(0)
+        self._made = made
+        self._height, self._arms = 0.0, made(0)
         self.follow({lift.joint: lift.home})
 
     @property
@@ -67,11 +68,22 @@ class LiftedArms(Mapping[str, Arm]):
         position = state.get(self.joint, self._height)
         if abs(position - self._height) <= _STEP:
             return
-        steps = round(position / _STEP)
-        found = self._at(steps)
+        self._arms, self._height = self._of(position), round(position / _STEP) * _STEP
+
+    def at(self, position: float) -> Mapping[str, Arm]:
+        """Return the arms as they are at a position of the lift, m.
+
+        Raises:
+            OpenArmError: LIMITS, for one outside the limits.
+        """
+        check_height(self.description.joint(self.joint), position)
+        return self._of(position)
+
+    def _of(self, position: float) -> Mapping[str, Arm]:
+        found = self._made(round(position / _STEP))
         for name, arm in found.items():
             arm.static = self._arms[name].static
-        self._height, self._arms = steps * _STEP, found
+        return found
 
     def update(self, arms: Mapping[str, Arm]) -> None:
         """Be the arms of another description of the same robot, at the height that they are at.
@@ -81,11 +93,8 @@ class LiftedArms(Mapping[str, Arm]):
         """
         if not isinstance(arms, LiftedArms):
             raise ValueError("expected arms on a lift")
-        self._at, self.description = arms._at, arms.description
-        found = self._at(round(self._height / _STEP))
-        for name, arm in found.items():
-            arm.static = self._arms[name].static
-        self._arms = found
+        self._made, self.description = arms._made, arms.description
+        self._arms = self._of(self._height)
         self.__dict__.pop("motion", None)
 
     @cached_property
@@ -138,9 +147,7 @@ class LiftMotion:
             OpenArmError: LIMITS, for a height outside the limits; IN_COLLISION, naming what would be hit and where.
         """
         joint = self._joint
-        if not joint.lower <= height <= joint.upper:
-            text = f"lift is asked for {height:g} m, allowed {joint.lower:g} to {joint.upper:g} m"
-            raise OpenArmError(Code.LIMITS, text)
+        check_height(joint, height)
         start = float(np.clip(now.state[joint.name], joint.lower, joint.upper))
         steps = max(2, int(np.ceil(abs(height - start) / _TRAVEL)) + 1)
         for name, robot in self._robots.items():
@@ -171,3 +178,14 @@ class LiftMotion:
             map=now.environment.map,
         )
         return CollisionScene(robot, around)
+
+
+def check_height(joint: Joint, height: float) -> None:
+    """Refuse a position of the lift that is outside its limits, m.
+
+    Raises:
+        OpenArmError: LIMITS.
+    """
+    if not joint.lower <= height <= joint.upper:
+        text = f"lift is asked for {height:g} m, allowed {joint.lower:g} to {joint.upper:g} m"
+        raise OpenArmError(Code.LIMITS, text)

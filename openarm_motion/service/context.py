@@ -134,10 +134,10 @@ class PlanningContext:
 
     def _others_hold(self, arms: Sequence[Arm], state: Mapping[str, float]) -> list[Box]:
         """What the other arms hold, where they hold it in a state."""
-        boxes: list[Box] = []
+        boxes, asked = list[Box](), {arm.name for arm in arms}
         for name, held in self._held.held.items():
             other = self._arms[name]
-            if other in arms or any(joint not in state for joint in other.names):
+            if name in asked or any(joint not in state for joint in other.names):
                 continue
             T = other.kinematics.fk(np.array([state[joint] for joint in other.names]))
             boxes += [replace(box, id=f"{box.id} in the {name} hand") for box in carried(held, T)]

@@ -155,12 +155,12 @@ class MotionService:
         """
         answer, begin = ApproachAnswer(), self.robot.now()
         try:
-            arm, stopped, wanted = self._arm(request.arm), self._stopped(cancelled), request.approach
-            if not len(request.start):
+            (arm, start), stopped, wanted = self._at_start(request), self._stopped(cancelled), request.approach
+            if not len(start):
                 await self._context.fresh()
             estimates = (*wanted.obstacles, *request.ignore_regions)
             prepared = self._context.prepare(
-                [arm], request.start, request.scale, stopped, estimates, [wanted.attached], request.scene_version
+                [arm], start, request.scale, stopped, estimates, [wanted.attached], request.scene_version
             )
             answer = replace(answer, scene_version=prepared.version)
 
@@ -425,6 +425,13 @@ class MotionService:
         if name not in self.arms:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"arm is {name!r}; arms: {', '.join(self.arms)}")
         return self.arms[name]
+
+    def _at_start(self, request: PlanApproachRequest) -> tuple[Arm, Array]:
+        """Return the arm and its start; where that begins with the lift's position, the arm as it is at that height."""
+        arm, start = self._arm(request.arm), request.start
+        if isinstance(self.arms, LiftedArms) and len(start) == arm.kinematics.n + 1:
+            return self.arms.at(float(start[0]))[arm.name], start[1:]
+        return arm, start
 
     def _stopped(self, cancelled: Callable[[], bool]) -> Callable[[], bool]:
         return lambda: self.closing or cancelled()

@@ -70,7 +70,7 @@ class PlanApproachRequest:
     Attributes:
         arm: Name of the arm.
         approach: Targets, obstacles and what is held.
-        start: (n,) joints that it starts from; empty: the present ones.
+        start: (n,) joints that it starts from, or (1 + n,), of a lift and the arm; empty: the present ones.
         scale: Velocity scale; 0: the default.
         ignore_regions: Boxes, base frame; what the map still shows there is left out.
         scene_version: That the planning scene must have; 0: any.

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Another height: a robot whose arms stand on a lift goes where one of them can grasp the object.
+
+The planner is asked for the grasp at other heights before anything moves, the nearest to the present one first; there
+the object is observed and picked as ever. Base frame, m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.planning.feasibility import FeasibilityCheck
+from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.requests.confirm import GRASP, agree
+from openarm_grasp.requests.request import Feasible, GraspOutcome
+from openarm_grasp.requests.task import Task
+from openarm_grasp.robot.interface import Planned
+from openarm_grasp.strategies.pick_and_place import pick_and_place
+
+#: A height that is nearer to the present one is no other, m.
+_SAME = 0.005
+
+
+@dataclass(frozen=True)
+class Height:
+    """A height at which a grasp was planned.
+
+    Attributes:
+        position: Of the lift, m.
+        present: Where it is, m.
+        arm: That grasps there.
+        plan: Of the grasp.
+    """
+
+    position: float
+    present: float
+    arm: str
+    plan: Planned
+
+    def __str__(self) -> str:
+        """Sentence for the status."""
+        return f"the lift goes from {self.present:.3f} to {self.position:.3f} m, where the {self.arm} arm reaches it"
+
+
+async def height(task: Task) -> GraspOutcome | None:
+    """Move the lift to another height and pick there, when no arm can do it at the present one."""
+    refused = task.outcome
+    if refused is None or task.robot.description.lift is None:
+        return None
+    found, faults = task.findings.need_sighting(), list[str]()
+    for position in heights(task):
+        try:
+            planned = await _planned(task, found, position)
+            if task.request.dry_run:
+                return replace(refused, code=Code.OK, message=f"can be done: {planned}", proof=Feasible(str(planned)))
+            standing = (found.target, *found.others)
+            parts = [(GRASP, planned.plan)]
+            if changed := await agree(task, planned.arm, str(planned), parts, task.note, standing):
+                raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning again')}; ask again")
+            task.note(str(planned))
+            await task.robot.move_lift(position)
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            faults.append(f"at {position:.3f} m: {error.message}")
+            continue
+        outcome = await pick_and_place(task, replace(task.request.about(found), why=f"the lift is at {position:.3f} m"))
+        if not task.may_go_on(outcome):
+            return outcome
+        faults.append(f"at {position:.3f} m: {outcome.message}")
+    why = faults[0] if faults else "it has no other height"
+    text = f"nor can it at another height of the lift ({len(faults)} tried): {why}"
+    raise OpenArmError(refused.code, text)
+
+
+def heights(task: Task) -> Iterator[float]:
+    """Give positions of the lift over its whole travel, the nearest to the present one first, m."""
+    description, step = task.robot.description, task.context.config.height.step
+    if description.lift is None:
+        return
+    joint, present = description.joint(description.lift.joint), task.robot.lift_position()
+    count = int(np.ceil((joint.upper - joint.lower) / step))
+    for position in sorted(np.linspace(joint.lower, joint.upper, count + 1), key=lambda p: abs(p - present)):
+        if abs(position - present) > _SAME:
+            yield float(position)
+
+
+async def _planned(task: Task, found: Sighting, position: float) -> Height:
+    """Plan the grasp at a height, with any arm.
+
+    Raises:
+        OpenArmError: One of `NO_WAY`; what the robot raises.
+    """
+    feasible, fault = FeasibilityCheck(task.robot, task.context), OpenArmError(Code.UNREACHABLE, "no arm")
+    for arm in task.context.arm_order("auto", float(found.target.p_base[1])):
+        try:
+            plan = await feasible.grasp(arm, found, at_height=position)
+            return Height(position, task.robot.lift_position(), arm, plan)
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            fault = error
+    raise fault
