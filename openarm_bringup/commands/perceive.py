@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm perceive`: what is on the table in a recorded frame of a depth camera."""
+"""`openarm perceive`: what is on the table in a frame of a depth camera: recorded, in a bag, or of the graph."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from openarm_bringup.commands.connect import Domain, join_graph
 from openarm_bringup.outcome import Outcome, as_text
 from openarm_common.errors import Code, OpenArmError
 
@@ -13,31 +14,41 @@ _WIDE = 150
 
 
 def perceive(
-    color: Path,
+    color: Path | None = None,
     depth: Path | None = None,
     *,
     info: Path | None = None,
+    camera: str = "",
+    start: float = 0.0,
     out: Path | None = None,
     depth_scale: float = 0.001,
     pose: Path | None = None,
     background: Path | None = None,
     near: float = 0.1,
     far: float = 3.0,
+    domain: Domain = None,
+    timeout: float = 10.0,
 ) -> Outcome:
-    """Find what stands on the table in a frame of a depth camera: two images, or an organised cloud.
+    """Find what stands on the table in a frame of a depth camera: two images, an organised cloud, a bag, or topics.
 
-    The table is found; with --pose it is level. Images are aligned and rectified.
+    The table is found; with --pose it is level. Depth is aligned with colour. Images of files are rectified. Without a
+    file, it is the next frame of a camera of the running graph, such as a RealSense (its `aligned_depth_to_color`).
 
     Args:
-        color: Colour image (PNG, JPEG), or an organised cloud (.pcd), which needs nothing else.
+        color: Colour image (PNG, JPEG); or an organised cloud (.pcd) or a bag (folder or .mcap), which need nothing
+            else; or nothing, for a camera of the running graph.
         depth: Depth image: PNG of 16 bits, 0 where nothing was measured.
         info: Intrinsics of both: YAML of a CameraInfo, or of fx, fy, cx, cy, or three rows of three numbers.
+        camera: Namespace of the camera in a bag or graph, such as /camera/camera, or a part of it; the only one when
+            not given.
+        start: Of a bag, only from this long after its first message on, s.
         out: Folder for pictures, the label image and a page.
         depth_scale: Metres of a count of the depth image.
         pose: Text file with the camera's pose (optical frame), four rows of four numbers, in a frame whose z is up.
         background: Depth image, or cloud, of the empty table or box from the same place.
         near: Nearest depth that counts, m.
         far: Farthest depth that counts, m.
+        timeout: Longest wait for a camera of the running graph, s.
     """
     from openarm_common.config import load_config
     from openarm_common.resources import config_dir
@@ -51,15 +62,26 @@ def perceive(
             Code.INVALID_ARGUMENT, f"--near {near:g} and --far {far:g} m; expected 0 < near < far <= 1000"
         )
     limits = DepthLimits(near=near, far=far)
-    if color.suffix.lower() == ".pcd":
-        if depth is not None or info is not None:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"{color} is a cloud; expected no depth image and no --info")
+    alone = color is None or color.is_dir() or color.suffix.lower() in (".pcd", ".mcap")
+    if alone and (depth is not None or info is not None):
+        what = "the running graph" if color is None else f"{color} is a cloud or a bag"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{what}; expected no depth image and no --info")
+    if color is None:
+        join_graph(domain)
+        from openarm_bringup.ros.camera_frame import frame_of_graph
+
+        frame = frame_of_graph(camera, limits, depth_scale, timeout)
+    elif color.suffix.lower() == ".pcd":
         frame = read_cloud(color, limits)
+    elif alone:
+        from openarm_bringup.ros.camera_frame import frame_of_bag
+
+        frame = frame_of_bag(color, camera, limits, depth_scale, start)
     elif depth is None or info is None:
         missing = "depth image" if depth is None else "--info"
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
-            f"no {missing}; expected COLOUR DEPTH --info INTRINSICS, or a cloud that ends in .pcd",
+            f"no {missing}; expected COLOUR DEPTH --info INTRINSICS, a cloud that ends in .pcd, or a bag",
         )
     else:
         frame = read_frame(color, depth, info, depth_scale, limits)

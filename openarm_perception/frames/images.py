@@ -15,12 +15,15 @@ import yaml
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.types import Array, Bytes
+from openarm_common.printable import brief
+from openarm_common.types import Array, Bytes, Floats
 from openarm_perception.frames.pcd import MOST_POINTS, read_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits, Points
 
 #: Most bytes of a file with an image, and of one with numbers.
 _MOST_BYTES, _MOST_TEXT = 256_000_000, 100_000
+#: Models of distortion that OpenCV's polynomials are.
+_MODELS = ("plumb_bob", "rational_polynomial")
 #: An organised cloud is a pinhole camera's when its points are within this of their pixels, rms.
 _PINHOLE = 1.0
 
@@ -86,6 +89,35 @@ def read_depth(path: Path, lens: Intrinsics, depth_scale: float, limits: DepthLi
         raise _refused(path, f"is {z.shape[1]}x{z.shape[0]} pixels", f"{lens.width}x{lens.height}, as the colour image")
     # as metres, whatever a count is
     return Deprojector(limits).organised(z.astype(np.float32) * np.float32(depth_scale), lens)
+
+
+def rectified(rgb: Bytes, z: Floats, lens: Intrinsics, d: Array, model: str) -> tuple[Bytes, Floats]:
+    """Remove the distortion of a lens from aligned images.
+
+    Args:
+        rgb: (h, w, 3) uint8.
+        z: (h, w) float32, m, not positive where nothing was measured.
+        lens: Intrinsics, before and after.
+        d: (n,) coefficients, as of a CameraInfo.
+        model: Their name there.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, for another model.
+    """
+    if model not in _MODELS or len(d) not in (4, 5, 8) or not np.isfinite(d).all():
+        text = (
+            f"distortion model {brief(model)} with {len(d)} coefficients; expected {', '.join(_MODELS)} with 4, 5 or 8"
+        )
+        raise OpenArmError(Code.BAD_IMAGE, text)
+    matrix, size = (
+        np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]]),
+        (lens.width, lens.height),
+    )
+    maps = cv2.initUndistortRectifyMap(matrix, d, None, matrix, size, cv2.CV_32FC1)
+    # a depth between that of two surfaces is that of none
+    depth = cv2.remap(z, *maps, cv2.INTER_NEAREST, borderValue=(0.0,))
+    color = cv2.remap(np.ascontiguousarray(rgb), *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return color.astype(np.uint8, copy=False), depth.astype(np.float32, copy=False)
 
 
 def read_cloud(path: Path, limits: DepthLimits) -> Frame:
