@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """How evenly the servo process commands sixteen motors on two buses, and how soon it stops them.
 
-    python -m benchmarks.can_loop [--seconds 10] [--trials 30] [--load 1] [--json PATH]
+    python -m benchmarks.can_loop [--seconds 10] [--trials 30] [--load 1] [--rates 250,500] [--beside sim] [--json PATH]
 
 Buses are local sockets to a process of emulated motors, so no figure has the time of an adapter, its driver or a wire
 in it. Each row of SCHED_FIFO has the same loop under SCHED_OTHER as its peer. Periods are of a histogram of 0.1 ms.
+With --beside, a graph runs meanwhile in which one pick follows the other, in place of busy processes.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.report import Row, write_report
+from openarm_common.domain import reserve_domain
 from openarm_common.motors.bus import emulated_buses
 from openarm_common.motors.wiring import axes_of, load_wiring
 from openarm_common.robot.description import RobotDescription
@@ -152,6 +156,37 @@ def load(n: int) -> Iterator[None]:
             one.wait()
 
 
+@contextmanager
+def beside(graph: str) -> Iterator[None]:
+    """Run a graph that picks."""
+    openarm = [sys.executable, "-m", "openarm_bringup.cli"]
+    domain = ["--domain", str(reserve_domain())]
+    up = subprocess.Popen([*openarm, "up", graph, *domain], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    ends = threading.Event()
+
+    def pick() -> None:
+        while not ends.is_set():
+            done = subprocess.run([*openarm, "pick", "red", *domain], capture_output=True, text=True, check=False)
+            print("beside:", done.stdout.strip().rpartition("\n")[2] or done.stderr.strip()[-200:], flush=True)
+
+    picks = threading.Thread(target=pick, daemon=True)
+    try:
+        assert up.stdout is not None
+        for line in up.stdout:
+            if " is ready after" in line:
+                break
+        else:
+            raise RuntimeError(f"the graph {graph} did not come up")
+        threading.Thread(target=up.stdout.read, daemon=True).start()
+        picks.start()
+        time.sleep(3.0)
+        yield
+    finally:
+        ends.set()
+        up.send_signal(signal.SIGINT)
+        up.wait(30.0)
+
+
 def measured(rate: float, fifo: bool, seconds: float, trials: int, silent: int) -> Figures:
     """Run the loop, stop it and silence motors, in turn."""
     settings = Settings(period_s=1.0 / rate, priority=60 if fifo else 0, ramp_s=0.05, silent=silent, stale_s=0.5)
@@ -218,16 +253,20 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--trials", type=int, default=30)
     parser.add_argument("--load", type=int, default=1, help="busy processes that run meanwhile")
+    parser.add_argument("--beside", default="", help="a graph that runs meanwhile")
+    parser.add_argument("--rates", default="250,500", help="of the loop, Hz")
     parser.add_argument("--silent", type=int, default=3, help="replies left out that stop an arm")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     rows = list[Row]()
-    with load(options.load):
-        for rate in (250.0, 500.0):
+    rates = [float(rate) for rate in options.rates.split(",")]
+    busy = f"the graph {options.beside}" if options.beside else f"{options.load} busy processes"
+    with beside(options.beside) if options.beside else load(options.load):
+        for rate in rates:
             fifo, other = (
                 measured(rate, kind, options.seconds, options.trials, options.silent) for kind in (True, False)
             )
-            print(f"{rate:g} Hz: {fifo.scheduling}, beside it {other.scheduling}; {options.load} busy processes")
+            print(f"{rate:g} Hz: {fifo.scheduling}, beside it {other.scheduling}; next to {busy}")
             n, peer = round(rate * options.seconds), other.scheduling
             target = 4.5 if rate == 250.0 else None
             rows += [

@@ -177,7 +177,8 @@ class ArmMachine:
         for motor in self.motors:
             if self.phase is Phase.ENABLING and motor.status == Status.DISABLED and not motor.gone:
                 continue
-            if why := motor.fault:
+            why = motor.fault or (motor.dead() if self.phase in (Phase.RAMPING, Phase.FOLLOWING) else "")
+            if why:
                 self.fail(why, now_ns)
                 return
         for motor in self.motors:

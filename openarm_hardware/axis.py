@@ -189,18 +189,20 @@ class MotorAxis:
         self.command = (q + part * (self._target[0] - q), tau + part * (self._target[1] - tau))
         self._left_s = max(0.0, self._left_s - seconds)
 
-    @property
-    def strays(self) -> str:
-        """Why the joint does not follow its command; else nothing."""
-        off = abs(self.q - self.command[0])
-        if self.axis.grips:
-            return ""
-        if self.q != self._anchor[0]:
+    def dead(self) -> str:
+        """Return why its position can't be true, by what was commanded since it changed last; else nothing."""
+        if self.axis.grips or self.q != self._anchor[0]:
             self._anchor = (self.q, self.command[0])
         elif abs(self.command[0] - self._anchor[1]) > self._settings.stuck:
             way = f"while its command went {self._settings.stuck:g} rad"
             return f"{self.axis} stays at {self.q:.4f} {way}; is its encoder dead, or the joint blocked?"
-        if not off > self._settings.tracking:
+        return ""
+
+    @property
+    def strays(self) -> str:
+        """Why the joint does not follow its command; else nothing."""
+        off = abs(self.q - self.command[0])
+        if self.axis.grips or not off > self._settings.tracking:
             return ""
         most = self._settings.tracking
         return f"{self.axis} is {off:.3f} rad off its command, expected {most:g} at most; is it blocked?"

@@ -166,7 +166,7 @@ def test_a_frozen_encoder_is_found_when_the_arm_moves() -> None:
         (q + (0.0 if a.grips else 0.5 * (bench.now_ns - since) * 1e-9), 1.0 if a.grips else 0.0)
         for q, a in zip(start, bench.axes, strict=True)
     ]
-    bench.until([Phase.HELD, Phase.HELD], 0.3)
+    bench.until([Phase.DAMPED, Phase.HELD], 0.3)
     assert "one_4" in bench.machine.text
     assert "is its encoder dead" in bench.machine.text
 
@@ -350,3 +350,49 @@ def test_an_arm_never_moves_by_itself_whatever_happens_to_it() -> None:
         for axis, was, now in zip(bench.axes, before, bench.q(), strict=True):
             assert abs(now - was) < (0.004 if axis.grips else 0.03), (trial, kind, axis.joint, was, now)
     assert bench.now_ns > PERIOD_NS
+
+
+def test_an_arm_that_is_stopped_in_motion_stays_whatever_is_commanded_until_it_is_reset() -> None:
+    """200 random faults while all joints move; the client goes on commanding, as if it had heard of nothing."""
+    rng = random.Random(11)
+    bench = Bench(silent=3, ramp_s=0.02).up()
+    kinds = ["silent", "error", "hot", "freeze", "bus_off", "power", "stop", "zero", "jump"]
+    for trial in range(200):
+        kind, joint, since = rng.choice(kinds), rng.choice([a for a in bench.axes if not a.grips]).joint, bench.now_ns
+        start = [s.command for s in bench.machine.motors()]
+        speeds = [0.0 if a.grips else rng.choice((-1.0, 1.0)) * rng.uniform(0.3, 0.6) for a in bench.axes]
+        speeds = [-abs(v) if q > 0.8 else abs(v) if q < -0.8 else v for v, q in zip(speeds, start, strict=True)]
+        leap = [0.0]
+
+        def moving(since=since, start=start, speeds=speeds, leap=leap, joint=joint) -> list[tuple[float, float]]:
+            t = (bench.now_ns - since) * 1e-9
+            rows = zip(start, speeds, bench.axes, strict=True)
+            return [(q + v * t + (leap[0] if a.joint == joint else 0.0), float(a.grips)) for q, v, a in rows]
+
+        bench.client = moving
+        bench.run(rng.uniform(0.05, 0.4))
+        if kind == "stop":
+            bench.exchange(bench.machine.stop(bench.now_ns, bench.waiting))
+        elif kind == "jump":
+            leap[0] = 0.5
+        else:
+            value = {"error": rng.choice((8, 9, 10, 11, 12, 13, 14)), "hot": 99, "zero": rng.choice((-0.3, 0.3))}
+            bench.buses.inject(kind, joint, value.get(kind, 0.0))
+        bench.run(0.8)
+        assert not {Phase.FOLLOWING, Phase.RAMPING} & {*bench.phases}, (trial, kind, joint)
+        assert bench.machine.text, (trial, kind)
+        stopped = bench.q()
+        bench.run(0.3)
+        for axis, was, now in zip(bench.axes, stopped, bench.q(), strict=True):
+            # without power a joint runs out against its friction
+            assert abs(now - was) < (0.05 if kind == "power" else 0.005), (trial, kind, axis.joint, was, now)
+        bench.buses.inject("clear")
+        for motor in bench.motors:
+            motor.zero = 0.0
+        bench.client = bench.here
+        bench.run(0.02)
+        bench.machine.reset(bench.now_ns)
+        bench.run(0.25)
+        assert bench.phases == UP, (trial, kind, joint, bench.machine.text)
+        for axis, was, now in zip(bench.axes, stopped, bench.q(), strict=True):
+            assert abs(now - was) < (0.004 if axis.grips else 0.05), (trial, kind, axis.joint, was, now)
