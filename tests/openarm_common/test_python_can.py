@@ -8,14 +8,13 @@ from typing import Any
 
 import pytest
 
-can: Any = pytest.importorskip("can", reason="needs python-can: install the extra `can`")
-
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.motors import frames
 from openarm_common.motors.axis import Axis
 from openarm_common.motors.bus import Bus, open_bus
 from openarm_common.motors.emulated import EmulatedBuses, EmulatedMotor
 
+can: Any = pytest.importorskip("can", reason="needs python-can: install the extra `can`")
 pytestmark = pytest.mark.requirement("R-08")
 ADDRESS = "python-can:virtual:openarm"
 
