@@ -154,6 +154,18 @@ class FaultsConfig(Config):
     seed: int = RunTimeField(default=0, ge=0, description="of which fail")
 
 
+class MoveGroupConfig(Config):
+    """The node `move_group`, which answers MoveIt's clients in the process of the motion node."""
+
+    enabled: bool = Field(default=True, description="whether it is there; false next to MoveIt's own")
+    gripper: str = Field(default="/{arm}_gripper_controller/gripper_cmd", description="action that moves a hand")
+    gripper_action: Literal["parallel", "classic"] = Field(
+        default="parallel", description="its type: ParallelGripperCommand, or the older GripperCommand"
+    )
+    finger_speed: float = Field(default=0.1, gt=0.0, le=2.0, description="of fingers in plans, m/s or rad/s")
+    clear_map: str = Field(default="/octomap/reset", description="service that /clear_octomap calls")
+
+
 class MotionConfig(Config):
     """Parameters of the motion node."""
 
@@ -173,3 +185,4 @@ class MotionConfig(Config):
     planning: PlanningConfig = Field(default_factory=PlanningConfig, description="search")
     execution: ExecutionConfig = Field(default_factory=ExecutionConfig, description="monitoring of execution")
     faults: FaultsConfig = Field(default_factory=FaultsConfig, description="fault injection")
+    move_group: MoveGroupConfig = Field(default_factory=MoveGroupConfig, description="MoveIt's names")

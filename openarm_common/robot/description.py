@@ -375,6 +375,27 @@ class RobotDescription:
                     poses[joint.child] = poses[joint.parent] @ self._joint_pose(joint, q)
         return {link: poses[link] for link in self.links}
 
+    def group_joints(self, group: str) -> tuple[str, ...]:
+        """Return the movable joints of a group of the SRDF, from the root; those of fixed and mimic joints left out.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the groups there are.
+        """
+        if group not in self.semantics.members:
+            there = ", ".join(self.semantics.members) or "none"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no group {group!r}; groups of {self.name!r}: {there}")
+        found: list[str] = []
+        for kind, *names in self.semantics.members[group]:
+            if kind == "group" and names[0] != group:
+                found += self.group_joints(names[0])
+            elif kind == "joint":
+                found.append(names[0])
+            elif kind == "chain":
+                before = self.chain(names[0])
+                found += [joint.name for joint in self.chain(names[1]) if joint not in before]
+        joints = [self.joint(name) for name in dict.fromkeys(found)]
+        return tuple(joint.name for joint in joints if joint.type != "fixed" and joint.mimic is None)
+
     def group_state(self, group: str, name: str) -> dict[str, float]:
         """Return the joint positions of a named posture, for example group "left_arm", state "home".
 

@@ -13,9 +13,13 @@ from openarm_common.robot.xml_text import attribute, by_name, floats, parse_root
 
 @dataclass(frozen=True)
 class Semantics:
-    """What the SRDF adds to the URDF. `states` is (group, state) → joint → position."""
+    """What the SRDF adds to the URDF. `states` is (group, state) → joint → position.
+
+    `members` is group → (`joint`, name), (`group`, name), or (`chain`, base link, tip link).
+    """
 
     groups: frozenset[str]
+    members: Mapping[str, tuple[tuple[str, ...], ...]]
     states: Mapping[tuple[str, str], Mapping[str, float]]
     allowed_collisions: frozenset[frozenset[str]]
 
@@ -32,7 +36,13 @@ def parse_srdf(text: str) -> Semantics:
     pairs = frozenset(
         frozenset((attribute(e, "link1"), attribute(e, "link2"))) for e in root.findall("disable_collisions")
     )
-    return Semantics(groups, MappingProxyType(states), pairs)
+    members = {attribute(e, "name"): tuple(map(_member, e)) for e in root.findall("group")}
+    return Semantics(groups, MappingProxyType(members), MappingProxyType(states), pairs)
+
+
+def _member(element: ET.Element) -> tuple[str, ...]:
+    keys = ("base_link", "tip_link") if element.tag == "chain" else ("name",)
+    return (element.tag, *(attribute(element, key) for key in keys))
 
 
 def shifted(text: str, offsets: Mapping[str, float]) -> str:

@@ -116,6 +116,8 @@ class BaseNode(Node, Generic[ConfigT]):
 
     #: Between two messages on /diagnostics, s of wall clock.
     REPORT_PERIOD_S = 1.0
+    #: Other nodes of the process, which run in the same executor and are closed before this one.
+    companions: tuple[BaseNode[Any], ...] = ()
 
     def __init__(self, name: str, model: type[ConfigT], **kwargs: Any) -> None:
         #: Messages that were refused, by topic.
@@ -345,7 +347,8 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
         if not rclpy.ok():  # the signal came while the node was being made
             raise ExternalShutdownException
         executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        for one in (node, *node.companions):
+            executor.add_node(one)
         signals.node = node
         executor.spin()
     except OpenArmError as error:
@@ -361,8 +364,9 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
         if executor is not None:
             executor.shutdown(timeout_sec=2.0)
         if node is not None:
-            node.close()
-            node.destroy_node()
+            for one in (*node.companions, node):
+                one.close()
+                one.destroy_node()
         rclpy.try_shutdown()
     sys.exit(code)
 

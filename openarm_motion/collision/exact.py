@@ -59,6 +59,7 @@ class CollisionContext:
         clearance: Distances to keep.
         map: What the cameras observe in addition; None is nothing.
         own: Whether the arm is checked against itself and the robot's body; False leaves the other arm and the boxes.
+        allowed: Pairs of links and bodies that may touch, by name (see `body_of`).
     """
 
     state: Mapping[str, float]
@@ -71,6 +72,7 @@ class CollisionContext:
     clearance: Clearance = field(default_factory=Clearance)
     map: OccupancyMap | None = None
     own: bool = True
+    allowed: frozenset[frozenset[str]] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,20 @@ class Contact:
 _LESS = 1e-3
 #: Two shapes further apart than this in a report are not worth a number.
 _REPORT_RANGE = 1.0
+#: What pairs that may touch are asked to keep, m: they never overlap by so much.
+_NOTHING_ASKED = -100.0
+#: Before a held body's name, and between the name of a body and the number of its shape.
+_HELD, _PART = "held ", " #"
+
+
+def part_name(body: str, number: int) -> str:
+    """Name of one of several shapes of a body."""
+    return f"{body}{_PART}{number}"
+
+
+def body_of(name: str) -> str:
+    """Name of the link or body that a shape belongs to, in the hand or not."""
+    return name.removeprefix(_HELD).partition(_PART)[0]
 
 
 class CollisionScene(LineChecks):
@@ -138,6 +154,10 @@ class CollisionScene(LineChecks):
             self._geometry.addCollisionPair(pin.CollisionPair(i, j))
         self._pair_index = pairs
         self._required = np.array(required)
+        if around.allowed:
+            bodies = [body_of(name) for name in self._names]
+            may = [frozenset((bodies[i], bodies[j])) in around.allowed for i, j in pairs]
+            self._required[may] = _NOTHING_ASKED
         self._measure()
         own, others = robot.arm.fixed | robot.arm.moving, {*robot.links, *self.carried}
         self._arms = np.array([self._names[j] in others and self._names[j] not in own for _, j in pairs])
@@ -181,9 +201,10 @@ class CollisionScene(LineChecks):
         return [np.array(pose.homogeneous) for pose in self._data.oMi]
 
     def required(self) -> list[tuple[int, int, float]]:
-        """Pairs of shapes and the distance that each must keep, m; without those with the map."""
+        """Pairs of shapes and the distance that each must keep, m; without those with the map, and those that may touch."""
         pairs = zip(self._pair_index, self._required, strict=True)
-        return [(i, j, float(d)) for (i, j), d in pairs if self._names[j] != MAP]
+        asked = (((i, j), d) for (i, j), d in pairs if self._names[j] != MAP and d > _NOTHING_ASKED)
+        return [(i, j, float(d)) for (i, j), d in asked]
 
     def map_clearance(self) -> dict[int, float]:
         """Distance that each shape keeps from a map, m, whether there is one or not."""
@@ -426,7 +447,7 @@ class CollisionScene(LineChecks):
 
     @staticmethod
     def _held_name(id: str) -> str:
-        return f"held {id}"
+        return f"{_HELD}{id}"
 
     def _add(self, name: str, joint: int, T: Array, solid: Solid) -> int:
         if name in self._boxes or name == MAP:

@@ -38,6 +38,8 @@ class LineChecks(ABC):
 
     #: (n,) how far the points that a joint moves are from its axis, at most, m.
     levers: Array
+    #: Whether more is checked than the scenes of the arms know, and so the fast layer.
+    exact_only: bool = False
 
     @property
     @abstractmethod

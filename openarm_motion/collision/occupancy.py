@@ -128,11 +128,13 @@ class Environment:
         solids: Bodies of the planning scene.
         map: What the cameras observed.
         arm_clearance: The arms keep at least this distance from each other, m.
+        allowed: Pairs of links and bodies that may touch, by name.
     """
 
     solids: tuple[Solid, ...] = ()
     map: OccupancyMap | None = None
     arm_clearance: float = 0.0
+    allowed: frozenset[frozenset[str]] = frozenset()
 
 
 #: An empty scene, and no map.

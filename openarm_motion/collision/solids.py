@@ -155,6 +155,11 @@ class Mesh(Solid):
         """Corners and fast shapes about it."""
         return Hull.of(self._hull[0])
 
+    @property
+    def hull_mesh(self) -> tuple[Array, NDArray[np.int64]]:
+        """Vertices (k, 3) of the hull, and its triangles (t, 3) turned outwards."""
+        return self._hull
+
     @cached_property
     def _hull(self) -> tuple[Array, NDArray[np.int64]]:
         """Vertices of the hull, and its triangles turned outwards."""

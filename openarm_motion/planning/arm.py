@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -54,6 +54,10 @@ class ValidatedPlan:
     trajectory: Trajectory
 
 
+#: Velocity scale of a request, or that and the one of acceleration and jerk; 0 is the default.
+Scale: TypeAlias = float | tuple[float, float]
+
+
 @dataclass(frozen=True, eq=False)
 class StartState:
     """What a request starts from.
@@ -61,14 +65,14 @@ class StartState:
     Attributes:
         state: Positions of the robot's joints by name, rad or m; both arms and fingers.
         start: (n,) where the arm starts; usually its part of `state`.
-        scale: Velocity scale; 0 means the default.
+        scale: Of velocity, or of velocity and acceleration; 0 means the default.
         stopped: Whether the request was cancelled; asked often.
         environment: Bodies of the planning scene and the map.
     """
 
     state: Mapping[str, float]
     start: Array
-    scale: float = 0.0
+    scale: Scale = 0.0
     stopped: Callable[[], bool] = never
     environment: Environment = NOTHING
 
@@ -93,7 +97,7 @@ class PlanningGroup(ABC):
     direct: bool = True
 
     @abstractmethod
-    def limits(self, scale: float) -> JointLimits:
+    def limits(self, scale: Scale) -> JointLimits:
         """Joint limits at the velocity scale of a request."""
 
     @abstractmethod
@@ -123,7 +127,7 @@ class PlanningGroup(ABC):
             iterations=search.iterations,
             seed=search.seed,
             stopped=now.stopped,
-            fast=cache(lambda: FastScene(scene.arms, scene.arms[0].distances)),
+            fast=None if scene.exact_only else cache(lambda: FastScene(scene.arms, scene.arms[0].distances)),
             resolution=(step, travel),
             limits=limits,
         )
@@ -170,6 +174,10 @@ class PlanningGroup(ABC):
         text = f"the plan of {self.title} failed the validation: {fault}"
         raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
 
+    def straight(self, now: StartState, goal: Array) -> Trajectory:
+        """The straight joint line from the start to a configuration (n,), timed and not checked."""
+        return self.timing(PlannedPath(np.stack([now.start, goal]), 0, 0), now.scale).trajectory()
+
     def _direct(self, scene: LineChecks, now: StartState, goals: Array) -> ValidatedPlan | None:
         """The straight joint line to one of the first goals, where it is free all the way on the exact layer."""
         for i, goal in enumerate(goals[:_DIRECT]):
@@ -183,7 +191,7 @@ class PlanningGroup(ABC):
                 return ValidatedPlan(path, trajectory)
         return None
 
-    def timing(self, path: PlannedPath, scale: float) -> PolylineTiming:
+    def timing(self, path: PlannedPath, scale: Scale) -> PolylineTiming:
         """Timings of a free path."""
         search = self.config.planning
         return PolylineTiming(search.timing, self.names, path.waypoints, self.limits(scale), search.period)
@@ -230,7 +238,7 @@ class Arm(PlanningGroup):
         self,
         state: Mapping[str, float],
         start: Sequence[float] | Array = (),
-        scale: float = 0.0,
+        scale: Scale = 0.0,
         stopped: Callable[[], bool] = never,
         environment: Environment = NOTHING,
     ) -> StartState:
@@ -267,12 +275,14 @@ class Arm(PlanningGroup):
             raise OpenArmError(Code.LIMITS, f"{what}: {self.kinematics.outside(q)}")
         return np.clip(q, self.kinematics.lower, self.kinematics.upper)
 
-    def scale(self, requested: float) -> float:
+    def scale(self, requested: Scale) -> float:
         """Velocity scale of a request; 0 is the default.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, when it is not 0 and not in (0, 1].
         """
+        if isinstance(requested, tuple):
+            requested = requested[0]
         if requested == 0.0:
             return self.config.limits.default_scale
         if not 0.0 < requested <= 1.0:
@@ -281,9 +291,9 @@ class Arm(PlanningGroup):
             )
         return requested
 
-    def limits(self, scale: float) -> JointLimits:
+    def limits(self, scale: Scale) -> JointLimits:
         """Joint limits at the velocity scale of a request."""
-        return self._limits.scaled(self.scale(scale))
+        return self._limits.scaled(self.scale(scale), self.scale(scale[1]) if isinstance(scale, tuple) else None)
 
     def scene(
         self,
@@ -327,6 +337,7 @@ class Arm(PlanningGroup):
                 fixed=fixed,
                 clearance=clearance.model_copy(update={"arms": apart}),
                 map=environment.map,
+                allowed=environment.allowed,
             ),
         )
 
@@ -368,11 +379,11 @@ class Arm(PlanningGroup):
             if error.code != Code.NO_PLAN:
                 raise
             hit = scene.first_hit(now.start, goals[0], search.edge_step, search.edge_travel)
-            contact = None if hit is None else scene.contacts(hit)[0]
+            contact = None if hit is None else next(iter(scene.contacts(hit)), None)
             blocked = "" if contact is None else f"; on the direct way {contact}"
             raise PlanFailedError(Code.NO_PLAN, error.message + blocked, "search", contact) from error
 
-    def time_line(self, line: Line, scale: float) -> Trajectory:
+    def time_line(self, line: Line, scale: Scale) -> Trajectory:
         """Timed straight line."""
         speed = self.config.limits.straight_speed * self.scale(scale)
         return time_path(self.names, line.q, line.s, self.limits(scale), speed, self.config.planning.period)

@@ -22,7 +22,7 @@ from openarm_motion.collision.exact import CollisionScene, Contact
 from openarm_motion.collision.line_checks import LineChecks
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.solids import Box
-from openarm_motion.planning.arm import Arm, PlanningGroup, StartState
+from openarm_motion.planning.arm import Arm, PlanningGroup, Scale, StartState
 from openarm_motion.planning.coordination import ActiveMotion, least_delay
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.planner import PlannedPath
@@ -147,7 +147,7 @@ class DualArm(PlanningGroup):
         )
         return DualArmScene(first, second, self.split)
 
-    def limits(self, scale: float) -> JointLimits:
+    def limits(self, scale: Scale) -> JointLimits:
         """Limits of all joints at a velocity scale."""
         first, second = (arm.limits(scale) for arm in self.arms)
         return JointLimits(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))

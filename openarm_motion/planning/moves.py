@@ -23,7 +23,7 @@ _ROUNDING = 1e-3
 #: Goals of one search.
 _GOALS = 24
 #: How far the elbow may swivel along a line when it can't keep its angle, rad; the smallest that works is taken.
-_DRIFTS = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5, 0.8, -0.8)
+LINE_DRIFTS = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5, 0.8, -0.8)
 #: A hand that leaves an object moves along the cells of its map, whose steps come nearer than the start by this, m;
 #: the end of the line keeps what is asked, so that no series of lines comes nearer and nearer.
 _PASSING = 0.003
@@ -91,7 +91,7 @@ def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes
     scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, environment=now.environment)
     arm.relax(scene, now.start)
     faults: list[PlanFailedError] = []
-    for drift in _DRIFTS if not np.isnan(start.swivel) else (0.0,):
+    for drift in LINE_DRIFTS if not np.isnan(start.swivel) else (0.0,):
         try:
             line = solve_line(arm.inverse, start, T_start, pose, margin, swivel_change=drift)
         except OpenArmError as error:

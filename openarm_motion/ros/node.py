@@ -3,7 +3,8 @@
 
 Actions /motion/plan_approach, /motion/move, /motion/move_arms and /motion/execute; services /motion/compute_ik,
 /motion/apply_scene and /motion/get_scene; latched /motion/scene, /motion/preview and /motion/attached_objects. Poses
-are in the base frame or any frame that the description or /tf_static knows.
+are in the base frame or any frame that the description or /tf_static knows. The node `move_group` of the same process
+answers to MoveIt's names.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
 from openarm_motion.config import MotionConfig
 from openarm_motion.ros import convert
+from openarm_motion.ros.move_group.node import MoveGroupNode
 from openarm_motion.ros.robot import NodeRobot
 from openarm_motion.service.faults import PlanFaults
 from openarm_motion.service.motion_service import MotionService, Report, make_arms, table_box
@@ -83,6 +85,10 @@ class MotionNode(BaseNode[MotionConfig]):
         self.create_service(ApplyScene, "/motion/apply_scene", self._on_apply)
         self.create_service(GetScene, "/motion/get_scene", self._on_get)
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
+        if config.move_group.enabled:
+            group = MoveGroupNode(self.service, config.move_group, config.controller, context=self.context)
+            group.on_scene = self._show_scene
+            self.companions = (group,)
         for arm in arms.values():
             self.get_logger().info(f"{arm.name} arm: {', '.join(arm.names)}; inverse kinematics: {arm.inverse.method}")
 

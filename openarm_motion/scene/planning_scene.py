@@ -22,6 +22,14 @@ class PlanningScene:
         self.fixed: tuple[Box, ...] = tuple(fixed)
         self.version = 1
         self._solids: dict[str, Solid] = {}
+        #: Pairs of links and bodies that may touch, in addition to those of the SRDF.
+        self.allowed: frozenset[frozenset[str]] = frozenset()
+
+    def allow(self, pairs: frozenset[frozenset[str]]) -> None:
+        """Let these pairs of links and bodies touch, by name, and no others but those of the SRDF."""
+        if pairs != self.allowed:
+            self.allowed = pairs
+            self.version += 1
 
     @property
     def solids(self) -> tuple[Solid, ...]:

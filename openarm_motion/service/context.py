@@ -13,7 +13,7 @@ from openarm_common.types import Array
 from openarm_motion.collision.occupancy import Environment, carried
 from openarm_motion.collision.solids import Box
 from openarm_motion.config import MotionConfig
-from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.arm import Arm, Scale, StartState
 from openarm_motion.scene.held import HeldObjects
 from openarm_motion.scene.map_view import MapState, MapView, unexplained
 from openarm_motion.scene.planning_scene import PlanningScene
@@ -73,7 +73,7 @@ class PlanningContext:
         self,
         arms: Sequence[Arm],
         start: Sequence[float] | Array,
-        scale: float,
+        scale: Scale,
         stopped: Callable[[], bool],
         estimates: Sequence[Box] = (),
         attached: Sequence[Sequence[Box]] = (),
@@ -111,13 +111,13 @@ class PlanningContext:
             if occupied is not None:
                 certain, robot = (*self._scene.fixed, *solids), arms[0].description  # with what is mounted on it
                 occupied = unexplained(occupied, config, robot, now.state, certain, uncertain)
-            return replace(now, state=later, environment=Environment(solids, occupied, clearance))
+            return replace(now, state=later, environment=Environment(solids, occupied, clearance, self._scene.allowed))
 
         # a graph without a map is as it should be; one with an old map is not
         note = f" without the map: {view.why}" if view.why and view.version else ""
         return Prepared(now, self._scene.version, note, complete)
 
-    def start(self, arm: Arm, start: Sequence[float] | Array, scale: float, stopped: Callable[[], bool]) -> StartState:
+    def start(self, arm: Arm, start: Sequence[float] | Array, scale: Scale, stopped: Callable[[], bool]) -> StartState:
         """Take the joints alone, without scene and map; arguments as `prepare`."""
         state: dict[str, float] = {}
         age = self._robot.state_age()

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from openarm_common.robot.work import Table
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid, box_from
 from openarm_motion.config import MotionConfig
+from openarm_motion.constraints.cartesian import CartesianGoal, along
+from openarm_motion.constraints.plans import RegionGoal, to_region
 from openarm_motion.planning import moves
 from openarm_motion.planning.alternative import explained, explained_approach, near_joints, near_pose
 from openarm_motion.planning.approach import ApproachPlan, plan_approach
@@ -70,6 +73,14 @@ _STRATEGIES: dict[Strategy, Callable[[DualArm, StartState, DualArmGoals, float],
     "together": plan_together,
     "staggered": plan_staggered,
 }
+
+
+#: No joint is given.
+EMPTY: Mapping[str, float] = MappingProxyType({})
+
+
+def _with(now: StartState, state: Mapping[str, float]) -> StartState:
+    return replace(now, state={**now.state, **state}) if state else now
 
 
 def silent(stage: str, progress: float) -> None:
@@ -194,12 +205,13 @@ class MotionService:
                 held, holding = self.memory.on_request(arm.name, request.attached, request.hand_empty)
                 around = moves.RequestBoxes(request.obstacles, held)
                 await self._context.fresh()
+                start = self._start(arm, request.state)
                 prepared = self._context.prepare(
-                    [arm], (), request.scale, stopped, request.obstacles, [held], request.scene_version
+                    [arm], start, request.scale, stopped, request.obstacles, [held], request.scene_version
                 )
                 answer = replace(answer, scene_version=prepared.version)
                 planner = self._planner(arm, request.goal, around)
-                trajectory = await self.robot.compute(lambda: planner(prepared.complete()))
+                trajectory = await self.robot.compute(lambda: planner(_with(prepared.complete(), request.state)))
                 message = f"planned, {trajectory.duration:.2f} s{prepared.note}{holding}"
                 answer = replace(answer, trajectory=trajectory, planning_time=self.robot.now() - begin, message=message)
                 self.on_plan({arm.name: (trajectory,)})
@@ -288,6 +300,25 @@ class MotionService:
         return {name: (self.arms[name].kinematics.tool_link, boxes) for name, boxes in self.memory.held.items()}
 
     # --- questions
+    async def surroundings(
+        self, arm_name: str, state: Mapping[str, float] = EMPTY
+    ) -> tuple[Arm, StartState, moves.RequestBoxes]:
+        """Return an arm, where it is and what is around it, and what it holds, as a plan would have it now.
+
+        Args:
+            arm_name: Name of the arm.
+            state: Positions of joints that are taken in place of the present ones.
+
+        Raises:
+            OpenArmError: as `PlanningContext.prepare`.
+        """
+        arm = self._arm(arm_name)
+        held, _ = self.memory.on_request(arm.name, (), False)
+        await self._context.fresh()
+        prepared = self._context.prepare([arm], self._start(arm, state), 0.0, self._stopped(never), (), [held])
+        now = _with(await self.robot.compute(prepared.complete), state)
+        return arm, now, moves.RequestBoxes((), held)
+
     def compute_ik(self, arm_name: str, pose: Array, seed: Sequence[float], *, position_only: bool) -> IkAnswer:
         """Solve the inverse kinematics of an arm's tool.
 
@@ -365,6 +396,16 @@ class MotionService:
         return paths
 
     # --- parts of these
+    def _start(self, arm: Arm, state: Mapping[str, float]) -> Sequence[float]:
+        """Joints of the arm where some are given in place of the present ones; empty for the present ones."""
+        if not any(name in state for name in arm.names):
+            return ()
+        present = self.robot.states.latest()[1]
+        missing = [name for name in arm.names if name not in state and name not in present]
+        if missing:
+            raise OpenArmError(Code.NOT_READY, f"neither the request nor /joint_states has {', '.join(missing)}")
+        return [state[name] if name in state else present[name] for name in arm.names]
+
     async def _follow(
         self, arm: Arm, motion: Motion, cancelled: Callable[[], bool], report: Report, max_delay: float
     ) -> float:
@@ -382,6 +423,10 @@ class MotionService:
                 lambda: moves.to_named(arm, now, goal.name, around),
                 lambda: near_joints(arm, now, around, named_posture(arm, goal.name, now.start)),
             )
+        if isinstance(goal, RegionGoal):
+            return lambda now: to_region(arm, now, goal, around)
+        if isinstance(goal, CartesianGoal):
+            return lambda now: along(arm, now, goal, around)
         pose = self.in_base(goal.pose, goal.frame)
         if isinstance(goal, PoseGoal):
             free = goal.position_only

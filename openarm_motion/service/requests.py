@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Literal, Self, TypeAlias
 
 import numpy as np
@@ -11,8 +13,11 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid
+from openarm_motion.constraints.cartesian import CartesianGoal
+from openarm_motion.constraints.plans import RegionGoal
 from openarm_motion.kinematics.chain import IkResult
 from openarm_motion.planning.approach import ApproachFailedError, ApproachPlan, ApproachRequest, Refused
+from openarm_motion.planning.arm import Scale
 from openarm_motion.planning.dual_arm import DualArmPlan
 from openarm_motion.scene.map_view import MapState
 from openarm_motion.timing.trajectory import Motion, Trajectory
@@ -57,7 +62,7 @@ class YieldGoal:
     name: str = "home"
 
 
-Goal: TypeAlias = JointGoal | NamedGoal | PoseGoal | LineGoal
+Goal: TypeAlias = JointGoal | NamedGoal | PoseGoal | LineGoal | RegionGoal | CartesianGoal
 DualGoal: TypeAlias = JointGoal | NamedGoal | PoseGoal | YieldGoal
 Strategy = Literal["any", "together", "staggered"]
 
@@ -94,10 +99,11 @@ class MoveRequest:
         obstacles: Boxes, base frame.
         attached: Boxes held by the arm, tool frame; empty: what it is known to hold.
         hand_empty: It holds nothing: what it was known to hold is forgotten.
-        scale: Velocity scale; 0: the default.
+        scale: Of velocity, or of velocity and acceleration; 0: the default.
         plan_only: Do not move.
         max_start_delay: Longest wait for clearance next to an arm under way, s.
         scene_version: That the planning scene must have; 0: any.
+        state: Positions of joints, by name, that are taken in place of the present ones.
     """
 
     arm: str
@@ -105,10 +111,11 @@ class MoveRequest:
     obstacles: tuple[Box, ...] = ()
     attached: tuple[Box, ...] = ()
     hand_empty: bool = False
-    scale: float = 0.0
+    scale: Scale = 0.0
     plan_only: bool = False
     max_start_delay: float = 0.0
     scene_version: int = 0
+    state: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,15 +38,17 @@ class JointLimits(NamedTuple):
     acceleration: Array
     jerk: Array
 
-    def scaled(self, scale: float) -> JointLimits:
-        """The limits times `scale`.
+    def scaled(self, velocity: float, acceleration: float | None = None) -> JointLimits:
+        """The limits times a scale; another one for acceleration and jerk where it is given.
 
         Raises:
-            OpenArmError: INVALID_ARGUMENT, when `scale` is not in (0, 1].
+            OpenArmError: INVALID_ARGUMENT, when one is not in (0, 1].
         """
-        if not 0.0 < scale <= 1.0:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"velocity_scale is {scale}, expected 0 < scale <= 1")
-        return JointLimits(*(limit * scale for limit in self))
+        changes = velocity if acceleration is None else acceleration
+        for scale, what in ((velocity, "velocity"), (changes, "acceleration")):
+            if not 0.0 < scale <= 1.0:
+                raise OpenArmError(Code.INVALID_ARGUMENT, f"{what}_scale is {scale}, expected 0 < scale <= 1")
+        return JointLimits(self.velocity * velocity, self.acceleration * changes, self.jerk * changes)
 
 
 @dataclass(frozen=True, eq=False)

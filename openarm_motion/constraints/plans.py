@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans to regions of configurations, on paths that stay in another region. Base frame, m, rad.
+
+A path that is constrained is tried as a straight joint line, then as a straight line of the tool (whose orientation
+turns from one end to the other, so a tolerance of orientation that holds at both mostly holds between them), then
+searched for by rejection. Whatever is found is timed, and validated densely for collisions and constraint alike.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
+from openarm_motion.collision.exact import CollisionScene, Contact
+from openarm_motion.collision.line_checks import LineChecks
+from openarm_motion.constraints.goals import in_region
+from openarm_motion.constraints.regions import Region
+from openarm_motion.kinematics.line import solve_line
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.planning.moves import RequestBoxes, free_scene
+from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.validation import dense_times, validate_trajectory
+
+#: Goals of one search, and those that lines are tried to.
+_GOALS, _LINES = 24, 6
+#: A straight joint line is looked at in steps of this before it is timed, rad.
+_STEP = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class RegionGoal:
+    """Any of several regions.
+
+    Attributes:
+        regions: Any of them will do.
+        path: What every configuration on the way satisfies.
+        time_limit: Of the search, s; 0: the default.
+    """
+
+    regions: tuple[Region, ...]
+    path: Region = field(default_factory=Region)
+    time_limit: float = 0.0
+
+
+def to_region(arm: Arm, now: StartState, goal: RegionGoal, around: RequestBoxes) -> Trajectory:
+    """Path to a configuration in one of the regions; free, or constrained.
+
+    Raises:
+        PlanFailedError: UNREACHABLE; IN_COLLISION, naming the pair; VIOLATION, when start or goal violates what the
+            path has to satisfy; NO_PLAN.
+        OpenArmError: INVALID_ARGUMENT; LIMITS; CANCELLED.
+    """
+    end = time.monotonic() + (goal.time_limit or arm.config.planning.time_limit)
+    scene = free_scene(arm, now, around)
+    wanted = _configurations(arm, now, goal.regions)
+    free = [q for q in wanted if not scene.collides(q)]
+    if not free:
+        contact = scene.contacts(wanted[0])[0]
+        more = f" (all {len(wanted)} configurations collide)" if len(wanted) > 1 else ""
+        raise PlanFailedError(Code.IN_COLLISION, f"goal of the {arm.name} arm: {contact}{more}", "goal", contact)
+    if not goal.path:
+        goals = np.array(free[:_GOALS])
+        return arm.plan_validated(scene, now, goals, max(end - time.monotonic(), 0.05)).trajectory
+    return _constrained(arm, now, scene, free, goal.path, end)
+
+
+def _configurations(arm: Arm, now: StartState, regions: Sequence[Region]) -> list[Array]:
+    found: list[Array] = []
+    fault: OpenArmError | None = None
+    for region in regions:
+        try:
+            found += in_region(arm, region, now.start, now.scale)
+        except OpenArmError as error:
+            fault = fault or error.settled()
+    if found:
+        return found
+    raise fault or PlanFailedError(Code.INVALID_ARGUMENT, "the goal constrains nothing", "request")
+
+
+def _constrained(
+    arm: Arm, now: StartState, scene: CollisionScene, free: Sequence[Array], path: Region, end: float
+) -> Trajectory:
+    lines = ConstrainedLines(arm, scene, path)
+    if text := lines.fault(now.start):
+        raise PlanFailedError(Code.VIOLATION, f"the start violates the path constraints: {text}", "start")
+    goals = [q for q in free if not lines.fault(q)][:_GOALS]
+    if not goals:
+        text = f"the goal violates the path constraints: {lines.fault(free[0])}"
+        raise PlanFailedError(Code.VIOLATION, text, "goal")
+    for trajectory in _lines(arm, now, lines, goals):
+        if now.stopped():
+            raise OpenArmError(Code.CANCELLED, "planning was stopped")
+        try:
+            lines.validate(trajectory)
+            return trajectory
+        except PlanFailedError:
+            continue
+    left = max(end - time.monotonic(), 0.05)
+    plan = arm.plan_validated(lines, now, np.array(goals), left, lambda _, trajectory: lines.validate(trajectory))
+    return plan.trajectory
+
+
+def _lines(arm: Arm, now: StartState, lines: ConstrainedLines, goals: Sequence[Array]) -> Iterator[Trajectory]:
+    """Straight joint lines, then straight lines of the tool, that satisfy the constraint."""
+    for q in goals[:_LINES]:
+        steps = max(2, int(np.ceil(float(np.abs(q - now.start).max()) / _STEP)))
+        if not lines.violations(now.start + np.linspace(0.0, 1.0, steps + 1)[:, None] * (q - now.start)).any():
+            yield arm.straight(now, q)
+    here = arm.inverse.classify(now.start)
+    margin = max(0.0, min(arm.config.planning.joint_margin, arm.kinematics.margin(now.start)))
+    for q in goals[:_LINES]:
+        try:
+            line = solve_line(arm.inverse, here, arm.kinematics.fk(now.start), arm.kinematics.fk(q), margin)
+        except OpenArmError:
+            continue
+        if not lines.violations(line.q).any():
+            yield arm.time_line(line, now.scale)
+
+
+class ConstrainedLines(LineChecks):
+    """A scene whose free configurations also lie in a region.
+
+    Args:
+        arm: The arm.
+        scene: What it keeps clear of.
+        region: Where it stays.
+    """
+
+    exact_only = True
+
+    def __init__(self, arm: Arm, scene: CollisionScene, region: Region) -> None:
+        self._arm, self._scene, self._region = arm, scene, region
+        self.levers = scene.levers
+
+    @property
+    def arms(self) -> Sequence[CollisionScene]:
+        """See `LineChecks`."""
+        return self._scene.arms
+
+    def contacts(self, q: ArrayLike) -> list[Contact]:
+        """See `LineChecks`."""
+        return self._scene.contacts(q)
+
+    def collides(self, q: ArrayLike) -> bool:
+        """See `LineChecks`; also where the region is left."""
+        return bool(self.violations(np.asarray(q)[None])[0]) or self._scene.collides(q)
+
+    def lenient(self, share: float, arms: float | None = None) -> AbstractContextManager[None]:
+        """See `LineChecks`."""
+        return self._scene.lenient(share, arms)
+
+    def swings(self) -> Array:
+        """See `LineChecks`."""
+        return self._scene.swings()
+
+    def further(self, by: Array) -> AbstractContextManager[None]:
+        """See `LineChecks`."""
+        return self._scene.further(by)
+
+    def violations(self, states: Array) -> Array:
+        """Which of the configurations (m, n) are outside of the region."""
+        return self._region.violations(self._arm.names, states, self._arm.kinematics.fk_many(states))
+
+    def fault(self, q: Array) -> str:
+        """What a configuration violates, in words, or ""."""
+        return self._region.fault(self._arm.names, q, self._arm.kinematics.fk(q))
+
+    def validate(self, trajectory: Trajectory) -> None:
+        """Check a trajectory densely, as `validate_trajectory`.
+
+        Raises:
+            PlanFailedError: IN_COLLISION or VIOLATION, with the time.
+        """
+        validate_trajectory(self._scene, trajectory)
+        times = dense_times(trajectory, self.levers)
+        states = trajectory.at(times)[0]
+        outside = np.flatnonzero(self.violations(states))
+        if outside.size:
+            k = int(outside[0])
+            text = f"after {times[k]:.2f} s of the trajectory {self.fault(states[k])}"
+            raise PlanFailedError(Code.VIOLATION, text, "certificate", at=float(times[k]))

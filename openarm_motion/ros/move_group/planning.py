@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests of MoveIt for plans and motions, as requests to the motion service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from moveit_msgs.action import ExecuteTrajectory
+from moveit_msgs.msg import MotionPlanRequest, MoveItErrorCodes, WorkspaceParameters
+from moveit_msgs.srv import GetCartesianPath
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import trajectory_from_msg, xyz
+from openarm_motion.collision.solids import Box
+from openarm_motion.constraints.cartesian import CartesianGoal
+from openarm_motion.constraints.names import RobotNames
+from openarm_motion.constraints.plans import RegionGoal
+from openarm_motion.ros.move_group.codes import MoveItError
+from openarm_motion.ros.move_group.convert import Converter, as_moveit
+from openarm_motion.ros.move_group.fields import CARTESIAN, EXECUTE, PLAN, check_fields
+from openarm_motion.scene.bodies import Body, boxes_about
+from openarm_motion.service.motion_service import MotionService
+from openarm_motion.service.requests import ExecuteRequest, MoveRequest
+from openarm_motion.timing.trajectory import Motion
+
+#: Name of the planning pipeline.
+PIPELINE = "openarm"
+#: A joint state that names the present configuration to within this has no other one in mind, rad.
+_PRESENT = 1e-3
+
+
+class Requests:
+    """Makes requests of messages.
+
+    Args:
+        service: Answers them.
+        names: Of groups and links.
+        convert: Messages to core data.
+    """
+
+    def __init__(self, service: MotionService, names: RobotNames, convert: Converter) -> None:
+        self._service, self._names, self._convert = service, names, convert
+
+    def plan(self, message: MotionPlanRequest, *, execute: bool = False) -> MoveRequest:
+        """What a plan request asks.
+
+        Raises:
+            OpenArmError: for what is not supported, or makes no sense.
+        """
+        check_fields(message, PLAN, "plan request")
+        arm = self.arm(message.group_name)
+        self._check_pipeline(message.pipeline_id, message.planner_id)
+        self._check_workspace(message.workspace_parameters)
+        limit = message.allowed_planning_time
+        if not 0.0 <= limit < float("inf") or message.num_planning_attempts < 0:
+            text = f"allowed_planning_time is {limit:g} s and num_planning_attempts {message.num_planning_attempts}"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}, expected numbers >= 0 (0: the default)")
+        goals = tuple(region for part in message.goal_constraints if (region := self._convert.region(part, arm)))
+        if not goals:
+            text = "goal_constraints has no constraint, expected at least one"
+            raise MoveItError(MoveItErrorCodes.INVALID_GOAL_CONSTRAINTS, text)
+        path = self._convert.region(message.path_constraints, arm)
+        goal = RegionGoal(goals, path, limit)
+        state = self._convert.state(message.start_state)
+        held = self._held(message, arm)
+        scale = (message.max_velocity_scaling_factor, message.max_acceleration_scaling_factor)
+        return MoveRequest(arm, goal, attached=held, scale=scale, plan_only=not execute, state=self._given(state))
+
+    def cartesian(self, message: GetCartesianPath.Request) -> MoveRequest:
+        """What a request for a Cartesian path asks.
+
+        Raises:
+            OpenArmError: as `plan`.
+        """
+        check_fields(message, CARTESIAN, "request for a Cartesian path")
+        arm = self.arm(message.group_name)
+        numbers = (message.max_step, message.revolute_jump_threshold, message.jump_threshold)
+        if not np.isfinite(numbers).all() or min(numbers) < 0.0:
+            text = "max_step, revolute_jump_threshold, jump_threshold"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{text} are {numbers}, expected numbers >= 0")
+        T_link_tool = se3.inverse(self._convert.on_tool(arm, message.link_name))
+        frame = message.header.frame_id
+        goal = CartesianGoal(
+            tuple(self._convert.pose(pose, frame) @ T_link_tool for pose in message.waypoints),
+            message.max_step,
+            message.revolute_jump_threshold,
+            message.jump_threshold,
+            message.avoid_collisions,
+            self._convert.region(message.path_constraints, arm),
+        )
+        state = self._given(self._convert.state(message.start_state))
+        scale = (message.max_velocity_scaling_factor, message.max_acceleration_scaling_factor)
+        return MoveRequest(arm, goal, scale=scale, plan_only=True, state=state)
+
+    def execute(self, message: ExecuteTrajectory.Goal, controller: Callable[[str], str]) -> ExecuteRequest:
+        """What a goal of /execute_trajectory asks.
+
+        Args:
+            message: The goal.
+            controller: Name of an arm's controller.
+
+        Raises:
+            OpenArmError: as `plan`.
+        """
+        check_fields(message, EXECUTE, "trajectory")
+        names, t, q, v, a = trajectory_from_msg(message.trajectory.joint_trajectory)
+        arm = self._names.arm_of_joints(names)
+        if not arm:
+            arms = "; ".join(f"{name}: {', '.join(arm.names)}" for name, arm in self._service.arms.items())
+            text = f"a trajectory of joints {', '.join(names) or '(none)'}; expected those of one arm ({arms})"
+            raise MoveItError(MoveItErrorCodes.INVALID_MOTION_PLAN, text)
+        there = controller(arm)
+        unknown = [name for name in message.controller_names if name != there]
+        if unknown:
+            text = f"controller_names has {unknown[0]!r}; the controller of the {arm} arm is {there!r}"
+            raise MoveItError(MoveItErrorCodes.CONTROL_FAILED, text)
+        return ExecuteRequest(arm, Motion(tuple(names), t, q, v, a))
+
+    def arm(self, group: str) -> str:
+        """The arm of a planning group.
+
+        Raises:
+            MoveItError: INVALID_GROUP_NAME.
+        """
+        with as_moveit(MoveItErrorCodes.INVALID_GROUP_NAME):
+            return self._names.arm_of_group(group)
+
+    def _given(self, state: dict[str, float]) -> dict[str, float]:
+        """What a state says other than that the robot is where it is."""
+        if self._service.robot.state_age() == float("inf"):
+            return state
+        present = self._service.robot.states.latest()[1]
+        if all(abs(value - present.get(name, np.inf)) <= _PRESENT for name, value in state.items()):
+            return {}
+        return state
+
+    def _held(self, message: MotionPlanRequest, arm: str) -> tuple[Box, ...]:
+        """Boxes that the start state says the arm holds, tool frame."""
+        out: list[Box] = []
+        for attached in message.start_state.attached_collision_objects:
+            link, body = attached.link_name, attached.object
+            with as_moveit(MoveItErrorCodes.INVALID_LINK_NAME):
+                if self._names.arm_of_link(link) != arm:
+                    raise OpenArmError(Code.INVALID_ARGUMENT, f"{body.id!r} is attached to {link!r}, not of the group")
+            self.check_touch(attached.touch_links, arm)
+            T, shapes = self._convert.shapes(body)
+            if not shapes:
+                text = f"attached object {body.id!r} of the start state has no shape"
+                raise MoveItError(MoveItErrorCodes.INVALID_OBJECT_NAME, text)
+            state = {**self._service.robot.states.latest()[1], **self._convert.state(message.start_state)}
+            kinematics = self._service.arms[arm].kinematics
+            T_base_tool = kinematics.fk(np.array([state[name] for name in kinematics.names]))
+            out += boxes_about(Body(body.id, T, shapes).moved(se3.inverse(T_base_tool)))
+        return tuple(out)
+
+    def check_touch(self, links: list[str], arm: str) -> None:
+        """Refuse links that may not touch what a hand holds: those of the hand always may.
+
+        Raises:
+            MoveItError: INVALID_LINK_NAME.
+        """
+        hand = self._service.arms[arm].robot.arm.hand
+        other = [link for link in links if link not in hand and link not in self._names.links_on_tool(arm)]
+        if other:
+            text = f"touch_links has {other[0]!r}; links of the hand, which always may touch: {', '.join(sorted(hand))}"
+            raise MoveItError(MoveItErrorCodes.INVALID_LINK_NAME, text)
+
+    def _check_pipeline(self, pipeline: str, planner: str) -> None:
+        known = self._service.config.planning.planner
+        if pipeline not in ("", PIPELINE):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"pipeline_id is {pipeline!r}, expected {PIPELINE!r} or empty")
+        if planner not in ("", known):
+            text = f"planner_id is {planner!r}, expected {known!r} (parameter planning.planner) or empty"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
+
+    def _check_workspace(self, message: WorkspaceParameters) -> None:
+        """As in MoveIt a workspace bounds the base of a mobile robot; the arms of this one stand where they are."""
+        low, high = xyz(message.min_corner), xyz(message.max_corner)
+        if not np.isfinite([*low, *high]).all() or (low > high).any():
+            text = f"workspace_parameters from {low.tolist()} to {high.tolist()} m, expected min_corner <= max_corner"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
+        self._convert.in_base(np.eye(4), message.header.frame_id)
