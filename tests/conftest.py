@@ -120,7 +120,8 @@ class RosProbe:
 
     def add(self, node):
         """Add a node; it is closed and destroyed at the end of the test."""
-        self.executor.add_node(node)
+        for one in (node, *getattr(node, "companions", ())):
+            self.executor.add_node(one)
         self.nodes.append(node)
         return node
 

@@ -26,6 +26,7 @@ PACKAGES = sorted(path.name for path in ROOT.glob("openarm_*") if (path / "__ini
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md"))]
 #: Message packages that a wheel of ROS 2 brings, and those that `interfaces/` brings.
 FROM_WHEELS = {
+    "shape_msgs",
     "action_msgs",
     "builtin_interfaces",
     "diagnostic_msgs",

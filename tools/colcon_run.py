@@ -17,7 +17,15 @@ import time
 from pathlib import Path
 
 SUITE = ("common", "sim_bridge", "perception", "calibration", "octomap", "motion", "grasp", "bringup")
-MESSAGES = ("openarm_interfaces", "tf2_msgs", "control_msgs", "vision_msgs", "octomap_msgs", "object_recognition_msgs", "moveit_msgs")
+MESSAGES = (
+    "openarm_interfaces",
+    "tf2_msgs",
+    "control_msgs",
+    "vision_msgs",
+    "octomap_msgs",
+    "object_recognition_msgs",
+    "moveit_msgs",
+)
 PACKAGES = (*(f"openarm_{name}" for name in SUITE), *MESSAGES)
 OPENARM = Path("openarm_bringup", "lib", "openarm_bringup", "openarm")
 BRIDGE = Path("openarm_sim_bridge", "lib", "openarm_sim_bridge", "sim_bridge")

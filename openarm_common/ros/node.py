@@ -116,7 +116,7 @@ class BaseNode(Node, Generic[ConfigT]):
 
     #: Between two messages on /diagnostics, s of wall clock.
     REPORT_PERIOD_S = 1.0
-    #: Other nodes of the process, which run in the same executor and are closed before this one.
+    #: Other nodes of the process, which run in its executor and end with it.
     companions: tuple[BaseNode[Any], ...] = ()
 
     def __init__(self, name: str, model: type[ConfigT], **kwargs: Any) -> None:
@@ -259,7 +259,11 @@ class BaseNode(Node, Generic[ConfigT]):
         """Stop all motion that the node commands; called before the process ends, while the graph is still there."""
 
     def close(self) -> None:
-        """Stop worker threads; subclasses with threads of their own extend this."""
+        """Stop worker threads, and take the companions down; subclasses with threads of their own extend this."""
+        companions, self.companions = self.companions, ()
+        for one in companions:
+            one.close()
+            one.destroy_node()
         self.__pool.shutdown(wait=True, cancel_futures=True)
 
     def __publish_diagnostics(self) -> None:
@@ -364,9 +368,8 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
         if executor is not None:
             executor.shutdown(timeout_sec=2.0)
         if node is not None:
-            for one in (*node.companions, node):
-                one.close()
-                one.destroy_node()
+            node.close()
+            node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(code)
 

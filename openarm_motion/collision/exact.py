@@ -201,7 +201,7 @@ class CollisionScene(LineChecks):
         return [np.array(pose.homogeneous) for pose in self._data.oMi]
 
     def required(self) -> list[tuple[int, int, float]]:
-        """Pairs of shapes and the distance that each must keep, m; without those with the map, and those that may touch."""
+        """Pairs of shapes and the distance that each must keep, m; not those with the map, and those that may touch."""
         pairs = zip(self._pair_index, self._required, strict=True)
         asked = (((i, j), d) for (i, j), d in pairs if self._names[j] != MAP and d > _NOTHING_ASKED)
         return [(i, j, float(d)) for (i, j), d in asked]

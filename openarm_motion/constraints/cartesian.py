@@ -4,15 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from openarm_common.types import Array
 from openarm_motion.collision.exact import CollisionScene
-from openarm_motion.constraints.plans import ConstrainedLines
-from openarm_motion.constraints.regions import Region
+from openarm_motion.constraints.asked import CartesianGoal
+from openarm_motion.constraints.lines import ConstrainedLines
 from openarm_motion.kinematics.line import line_poses
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.failure import PlanFailedError
@@ -25,27 +25,6 @@ _MAX_STEP = 0.2
 #: Fewest points of a line that can be timed, and the nearest that points are in time, s.
 _FEWEST = 7
 _SHORTEST = 0.002
-
-
-@dataclass(frozen=True, eq=False)
-class CartesianGoal:
-    """Poses of the tool, joined by straight lines.
-
-    Attributes:
-        waypoints: (4, 4) each, base frame; the present pose comes first.
-        max_step: Way of the tool between two points of the trajectory, m; 0: as the sampling period has it.
-        revolute_jump: A joint that changes by more than this between two points ends the path, rad; 0: 0.2 rad.
-        jump_factor: A change of the joints that is so many times the average one ends the path; 0: none does.
-        avoid_collisions: What collides ends the path.
-        path: What leaves this ends the path.
-    """
-
-    waypoints: tuple[Array, ...]
-    max_step: float = 0.0
-    revolute_jump: float = 0.0
-    jump_factor: float = 0.0
-    avoid_collisions: bool = True
-    path: Region = field(default_factory=Region)
 
 
 @dataclass(frozen=True, eq=False)

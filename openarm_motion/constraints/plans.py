@@ -10,44 +10,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.exact import CollisionScene, Contact
-from openarm_motion.collision.line_checks import LineChecks
+from openarm_motion.collision.exact import CollisionScene
+from openarm_motion.constraints.asked import RegionGoal
 from openarm_motion.constraints.goals import in_region
+from openarm_motion.constraints.lines import ConstrainedLines
 from openarm_motion.constraints.regions import Region
 from openarm_motion.kinematics.line import solve_line
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.moves import RequestBoxes, free_scene
 from openarm_motion.timing.trajectory import Trajectory
-from openarm_motion.timing.validation import dense_times, validate_trajectory
 
 #: Goals of one search, and those that lines are tried to.
 _GOALS, _LINES = 24, 6
 #: A straight joint line is looked at in steps of this before it is timed, rad.
 _STEP = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class RegionGoal:
-    """Any of several regions.
-
-    Attributes:
-        regions: Any of them will do.
-        path: What every configuration on the way satisfies.
-        time_limit: Of the search, s; 0: the default.
-    """
-
-    regions: tuple[Region, ...]
-    path: Region = field(default_factory=Region)
-    time_limit: float = 0.0
 
 
 def to_region(arm: Arm, now: StartState, goal: RegionGoal, around: RequestBoxes) -> Trajectory:
@@ -123,67 +105,3 @@ def _lines(arm: Arm, now: StartState, lines: ConstrainedLines, goals: Sequence[A
             continue
         if not lines.violations(line.q).any():
             yield arm.time_line(line, now.scale)
-
-
-class ConstrainedLines(LineChecks):
-    """A scene whose free configurations also lie in a region.
-
-    Args:
-        arm: The arm.
-        scene: What it keeps clear of.
-        region: Where it stays.
-    """
-
-    exact_only = True
-
-    def __init__(self, arm: Arm, scene: CollisionScene, region: Region) -> None:
-        self._arm, self._scene, self._region = arm, scene, region
-        self.levers = scene.levers
-
-    @property
-    def arms(self) -> Sequence[CollisionScene]:
-        """See `LineChecks`."""
-        return self._scene.arms
-
-    def contacts(self, q: ArrayLike) -> list[Contact]:
-        """See `LineChecks`."""
-        return self._scene.contacts(q)
-
-    def collides(self, q: ArrayLike) -> bool:
-        """See `LineChecks`; also where the region is left."""
-        return bool(self.violations(np.asarray(q)[None])[0]) or self._scene.collides(q)
-
-    def lenient(self, share: float, arms: float | None = None) -> AbstractContextManager[None]:
-        """See `LineChecks`."""
-        return self._scene.lenient(share, arms)
-
-    def swings(self) -> Array:
-        """See `LineChecks`."""
-        return self._scene.swings()
-
-    def further(self, by: Array) -> AbstractContextManager[None]:
-        """See `LineChecks`."""
-        return self._scene.further(by)
-
-    def violations(self, states: Array) -> Array:
-        """Which of the configurations (m, n) are outside of the region."""
-        return self._region.violations(self._arm.names, states, self._arm.kinematics.fk_many(states))
-
-    def fault(self, q: Array) -> str:
-        """What a configuration violates, in words, or ""."""
-        return self._region.fault(self._arm.names, q, self._arm.kinematics.fk(q))
-
-    def validate(self, trajectory: Trajectory) -> None:
-        """Check a trajectory densely, as `validate_trajectory`.
-
-        Raises:
-            PlanFailedError: IN_COLLISION or VIOLATION, with the time.
-        """
-        validate_trajectory(self._scene, trajectory)
-        times = dense_times(trajectory, self.levers)
-        states = trajectory.at(times)[0]
-        outside = np.flatnonzero(self.violations(states))
-        if outside.size:
-            k = int(outside[0])
-            text = f"after {times[k]:.2f} s of the trajectory {self.fault(states[k])}"
-            raise PlanFailedError(Code.VIOLATION, text, "certificate", at=float(times[k]))

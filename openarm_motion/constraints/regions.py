@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from openarm_common.errors import Code, OpenArmError
@@ -158,10 +159,12 @@ class Region:
             out.append((f"rad of the orientation of {orientation.link}", np.where(beyond > _SLACK_RAD, beyond, 0.0)))
         return out
 
-    def violations(self, names: Sequence[str], states: Array, poses: Array) -> Array:
+    def violations(self, names: Sequence[str], states: Array, poses: Array) -> NDArray[np.bool_]:
         """Which of the configurations (m,) are outside; arguments as `outside`."""
-        parts = [beyond > 0.0 for _, beyond in self.outside(names, states, poses)]
-        return np.any(parts, axis=0) if parts else np.zeros(len(states), np.bool_)
+        out = np.zeros(len(states), np.bool_)
+        for _, beyond in self.outside(names, states, poses):
+            out |= beyond > 0.0
+        return out
 
     def fault(self, names: Sequence[str], q: Array, pose: Array) -> str:
         """What one configuration (n,) violates most, in words; "" when it is inside."""

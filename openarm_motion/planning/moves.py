@@ -13,7 +13,7 @@ from openarm_common.types import Array
 from openarm_motion.collision.exact import CollisionScene
 from openarm_motion.collision.solids import Box
 from openarm_motion.kinematics.line import line_contact, solve_line
-from openarm_motion.planning.arm import Arm, StartState, first_contact, segment_time
+from openarm_motion.planning.arm import Arm, Scale, StartState, first_contact, segment_time
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.timing.trajectory import Trajectory
 from openarm_motion.timing.validation import validate_trajectory
@@ -172,7 +172,7 @@ def goal_configurations(arm: Arm, now: StartState, start: Array, pose: Array, *,
     return np.array(ordered[:: max(1, len(ordered) // _MOST)][:_MOST])
 
 
-def _configurations(arm: Arm, scale: float, start: Array, pose: Array, *, position_only: bool) -> list[Array]:
+def _configurations(arm: Arm, scale: Scale, start: Array, pose: Array, *, position_only: bool) -> list[Array]:
     """All configurations with the tool at a pose, those that are reached first come first; UNREACHABLE without one.
 
     Where none keeps the margin from the joint limits, those within the limits are taken.

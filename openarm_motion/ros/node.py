@@ -9,6 +9,7 @@ answers to MoveIt's names.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -29,7 +30,6 @@ from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
 from openarm_motion.config import MotionConfig
 from openarm_motion.ros import convert
-from openarm_motion.ros.move_group.node import MoveGroupNode
 from openarm_motion.ros.robot import NodeRobot
 from openarm_motion.service.faults import PlanFaults
 from openarm_motion.service.motion_service import MotionService, Report, make_arms, table_box
@@ -48,6 +48,8 @@ AnswerT = TypeVar("AnswerT", bound=MotionAnswer)
 RequestT = TypeVar("RequestT")
 MovingT = TypeVar("MovingT", ExecuteRequest, MoveRequest, MoveArmsRequest)
 
+#: An adapter that is imported, with MoveIt's messages, where it is wanted.
+_MOVE_GROUP = "openarm_motion.ros.move_group.node"
 #: Pace of feedback while planning, s.
 _FEEDBACK = 0.1
 #: Arms that move have this long to come to rest when the process is to end, s.
@@ -86,7 +88,8 @@ class MotionNode(BaseNode[MotionConfig]):
         self.create_service(GetScene, "/motion/get_scene", self._on_get)
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
         if config.move_group.enabled:
-            group = MoveGroupNode(self.service, config.move_group, config.controller, context=self.context)
+            kind: Any = importlib.import_module(_MOVE_GROUP).MoveGroupNode
+            group = kind(self.service, config.move_group, config.controller, self._holds.check, context=self.context)
             group.on_scene = self._show_scene
             self.companions = (group,)
         for arm in arms.values():

@@ -23,8 +23,9 @@ from openarm_common.robot.work import Table
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid, box_from
 from openarm_motion.config import MotionConfig
-from openarm_motion.constraints.cartesian import CartesianGoal, along
-from openarm_motion.constraints.plans import RegionGoal, to_region
+from openarm_motion.constraints.asked import CartesianGoal, RegionGoal
+from openarm_motion.constraints.cartesian import along
+from openarm_motion.constraints.plans import to_region
 from openarm_motion.planning import moves
 from openarm_motion.planning.alternative import explained, explained_approach, near_joints, near_pose
 from openarm_motion.planning.approach import ApproachPlan, plan_approach

@@ -13,8 +13,7 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid
-from openarm_motion.constraints.cartesian import CartesianGoal
-from openarm_motion.constraints.plans import RegionGoal
+from openarm_motion.constraints.asked import CartesianGoal, RegionGoal
 from openarm_motion.kinematics.chain import IkResult
 from openarm_motion.planning.approach import ApproachFailedError, ApproachPlan, ApproachRequest, Refused
 from openarm_motion.planning.arm import Scale

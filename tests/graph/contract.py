@@ -22,10 +22,13 @@ QOS = {
     "latched": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
     "best effort": (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
 }
-#: What rclpy and actions add by themselves, subscriptions of the bridge, and the camera info of the spectator camera.
+#: What rclpy and actions add by themselves, subscriptions of the bridge and of move_group, and the camera info of the
+#: spectator camera.
 IMPLICIT = re.compile(
     r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|/joint_trajectory$|^/cloud_in$"
     r"|^/spectator/color/camera_info$|/_alive$"
+    # what clients of MoveIt publish
+    r"|^/collision_object$|^/attached_collision_object$|^/planning_scene$|^/trajectory_execution_event$"
 )
 #: Services that every node has, or every managed node.
 STANDARD = (
@@ -46,7 +49,7 @@ def settled(node: Node) -> dict[str, list[str]]:
 def stated_publishers() -> dict[str, list[str]]:
     """Return the nodes that publish each topic."""
     rows = [(name, rest.split("|")[1].strip()) for name, kind, rest in ROW.findall(INTERFACES) if "/msg/" in kind]
-    everyone = sorted(load_graph("sim").nodes)
+    everyone = sorted([*load_graph("sim").nodes, "move_group"])  # of the process of motion
     return {name: everyone if who == "all" else sorted(w.strip() for w in who.split(",")) for name, who in rows}
 
 

@@ -2,7 +2,8 @@
 """The upstream types that the suite generates itself are the upstream types: the graph reports upstream's hashes.
 
 The constants were computed from upstream's message text (tf2 for Jazzy, octomap_msgs 2.0.0, control_msgs 5.8.0,
-vision_msgs 4.1.1, moveit_msgs 2.6.0), not from ours. A hash that differs means fields that a peer with the upstream package misreads.
+vision_msgs 4.1.1, moveit_msgs 2.6.0), not from ours. A hash that differs means fields that a peer with the upstream
+package misreads.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from control_msgs.action import GripperCommand, ParallelGripperCommand
@@ -15,10 +15,12 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.actions import ActionClient
 from openarm_common.ros.node import BaseNode
 from openarm_motion.config import MoveGroupConfig
-from openarm_motion.constraints.names import RobotNames
 from openarm_motion.ros.move_group.codes import MoveItError
-from openarm_motion.service.motion_service import MotionService
 from openarm_motion.timing.trajectory import Motion
+
+if TYPE_CHECKING:
+    from openarm_motion.constraints.names import RobotNames
+    from openarm_motion.service.motion_service import MotionService
 
 #: Shortest plan of a hand, s.
 _SHORTEST = 0.1
@@ -104,7 +106,7 @@ class Hands:
         else:
             goal = ParallelGripperCommand.Goal()
             goal.command.name, goal.command.position = [finger], [position]
-        handle = await client.send_goal_async(goal)
+        handle: Any = await client.send_goal_async(goal)
         if not handle.accepted:
             raise OpenArmError(Code.EXECUTION_FAILED, f"{client.name} rejected the position {position:g} of {finger}")
         result = (await handle.get_result_async()).result

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Awaitable, Callable
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import Point, PoseStamped
@@ -25,6 +25,7 @@ from moveit_msgs.msg import (
     MoveItErrorCodes,
     PlannerInterfaceDescription,
     RobotState,
+    RobotTrajectory,
 )
 from moveit_msgs.srv import (
     GetCartesianPath,
@@ -56,8 +57,10 @@ from openarm_motion.ros.move_group.fields import FK, IK, MOVE, VALIDITY, check_f
 from openarm_motion.ros.move_group.hands import Hands
 from openarm_motion.ros.move_group.planning import PIPELINE, Requests
 from openarm_motion.ros.move_group.scene import SceneServer
-from openarm_motion.service.motion_service import MotionService
 from openarm_motion.timing.trajectory import Motion
+
+if TYPE_CHECKING:
+    from openarm_motion.service.motion_service import MotionService
 
 ResponseT = TypeVar("ResponseT")
 
@@ -73,12 +76,20 @@ class MoveGroupNode(BaseNode[NoParameters]):
         service: Of the motion node.
         config: Parameters.
         controller: Name of the trajectory action of an arm.
+        check_hold: Refuses a goal, by arm and id, that would move an arm that another client holds.
     """
 
-    def __init__(self, service: MotionService, config: MoveGroupConfig, controller: str, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        service: MotionService,
+        config: MoveGroupConfig,
+        controller: str,
+        check_hold: Callable[[str, bytes], None],
+        **kwargs: Any,
+    ) -> None:
         # a remapping of the process's node name is for the motion node
         super().__init__("move_group", NoParameters, use_global_arguments=False, **kwargs)
-        self._service, self._controller = service, controller
+        self._service, self._controller, self._check_hold = service, controller, check_hold
         robot = self.description
         self.declare_parameter("robot_description", robot.urdf)
         self.declare_parameter("robot_description_semantic", robot.srdf)
@@ -128,6 +139,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
             execute = not goal.planning_options.plan_only
             motion = await self._move(goal.request, answer, handle, execute=execute)
             if goal.request.group_name in self._hands.groups and execute and motion is not None:
+                self._check_hold(self._hands.groups[goal.request.group_name], bytes(handle.goal_id.uuid))
                 await self._hands.execute(self._hands.groups[goal.request.group_name], motion)
         except OpenArmError as error:
             self._refuse("/move_action", error, answer)
@@ -145,10 +157,12 @@ class MoveGroupNode(BaseNode[NoParameters]):
         try:
             names = list(handle.request.trajectory.joint_trajectory.joint_names)
             if arm := self._hands.of_joints(names):
+                self._check_hold(arm, bytes(handle.goal_id.uuid))
                 names, t, q, _, _ = trajectory_from_msg(handle.request.trajectory.joint_trajectory)
                 await self._hands.execute(arm, Motion(tuple(names), t, q))
             else:
                 request = self._requests.execute(handle.request, lambda arm: self._controller.format(arm=arm))
+                self._check_hold(request.arm, bytes(handle.goal_id.uuid))
                 (await self._service.execute(request, self._cancelled(handle))).require()
             result.error_code = error_code(None, "arrived")
         except OpenArmError as error:
@@ -196,17 +210,19 @@ class MoveGroupNode(BaseNode[NoParameters]):
         answer.trajectory_start = self._state(request.start_state)
         if request.group_name in self._hands.groups:
             motion: Motion | None = self._hands.plan(request)
+            answer.trajectory = trajectory_msg(motion)
             answer.error_code = error_code(None, "planned")
         else:
             cancelled = self._cancelled(handle) if handle is not None else (lambda: False)
             asked = self._requests.plan(request, execute=execute)
+            if handle is not None and execute:
+                self._check_hold(asked.arm, bytes(handle.goal_id.uuid))
             reply = await self._service.move(asked, cancelled, self._reporter(handle))
             motion, answer.planning_time = reply.trajectory, reply.planning_time
             answer.trajectory = trajectory_msg(motion)
             reply.require()
             answer.error_code = error_code(None, reply.message)
-        answer.trajectory = trajectory_msg(motion)
-        self.show(answer.trajectory_start, motion)
+        self.show(answer.trajectory_start, answer.trajectory)
         return motion
 
     def _reporter(self, handle: ServerGoalHandle | None) -> Callable[[str, float], None]:
@@ -231,13 +247,12 @@ class MoveGroupNode(BaseNode[NoParameters]):
             raise OpenArmError(Code.INTERNAL, "the plan is no Cartesian path")
         response.solution, response.fraction = trajectory_msg(path), path.fraction
         response.error_code = error_code(None, path.ended and f"ends after {path.fraction:.0%}: {path.ended}")
-        self.show(response.start_state, path)
+        self.show(response.start_state, response.solution)
 
-    def show(self, start: RobotState, motion: Motion | None) -> None:
+    def show(self, start: RobotState, trajectory: RobotTrajectory) -> None:
         """Publish a plan on /display_planned_path."""
-        message = DisplayTrajectory(model_id=self.description.name, trajectory_start=start)
-        message.trajectory = [trajectory_msg(motion)]
-        self._display.publish(message)
+        name = self.description.name
+        self._display.publish(DisplayTrajectory(model_id=name, trajectory_start=start, trajectory=[trajectory]))
 
     def _state(self, given: RobotState) -> RobotState:
         """The state that a plan starts from."""

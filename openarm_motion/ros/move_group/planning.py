@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from moveit_msgs.action import ExecuteTrajectory
@@ -14,16 +15,17 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import trajectory_from_msg, xyz
 from openarm_motion.collision.solids import Box
-from openarm_motion.constraints.cartesian import CartesianGoal
-from openarm_motion.constraints.names import RobotNames
-from openarm_motion.constraints.plans import RegionGoal
+from openarm_motion.constraints.asked import CartesianGoal, RegionGoal
 from openarm_motion.ros.move_group.codes import MoveItError
 from openarm_motion.ros.move_group.convert import Converter, as_moveit
 from openarm_motion.ros.move_group.fields import CARTESIAN, EXECUTE, PLAN, check_fields
 from openarm_motion.scene.bodies import Body, boxes_about
-from openarm_motion.service.motion_service import MotionService
 from openarm_motion.service.requests import ExecuteRequest, MoveRequest
 from openarm_motion.timing.trajectory import Motion
+
+if TYPE_CHECKING:
+    from openarm_motion.constraints.names import RobotNames
+    from openarm_motion.service.motion_service import MotionService
 
 #: Name of the planning pipeline.
 PIPELINE = "openarm"

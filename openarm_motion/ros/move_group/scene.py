@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from moveit_msgs.msg import (
@@ -23,13 +24,15 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_common.types import Array
-from openarm_motion.constraints.names import RobotNames
 from openarm_motion.ros.move_group.codes import MoveItError
 from openarm_motion.ros.move_group.convert import Converter, as_moveit, object_msg, state_msg
 from openarm_motion.ros.move_group.fields import ATTACHED, OBJECT, SCENE, check_fields
-from openarm_motion.ros.move_group.planning import Requests
 from openarm_motion.scene.bodies import Body, Draft, SceneBodies
-from openarm_motion.service.motion_service import MotionService
+
+if TYPE_CHECKING:
+    from openarm_motion.constraints.names import RobotNames
+    from openarm_motion.ros.move_group.planning import Requests
+    from openarm_motion.service.motion_service import MotionService
 
 #: A state in a scene that is further than this from where the robot is asks for another one, rad.
 _PRESENT = 0.05
@@ -51,7 +54,7 @@ class SceneServer:
 
     def __init__(
         self,
-        node: BaseNode[object],
+        node: BaseNode[Any],
         service: MotionService,
         description: RobotDescription,
         names: RobotNames,
