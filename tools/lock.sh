@@ -13,5 +13,6 @@ lock() {
 lock requirements.lock pyproject.toml --extra test --group setup "$@"
 lock requirements-build.lock --group interfaces "$@"
 lock requirements-dev.lock --group dev --constraints requirements.lock "$@"
+printf '%s\n' pymoveit2 trimesh | lock requirements-moveit.lock --constraints requirements.lock "$@" -
 echo foxglove-sdk | lock requirements-viz.lock --constraints requirements.lock "$@" -
 printf 'pyrealsense2\nlibusb-package\n' | lock requirements-realsense.lock --constraints requirements.lock "$@" -
