@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leave-one-out on sets of real robots: closed forms, the refinement without and with misfit, joint zeros.
+"""Leave-one-out on sets of real robots: closed forms, the refinement without misfit and as chosen, joint zeros.
 
     python -m benchmarks.real_handeye FOLDER [--robot openarm_v1]
 
@@ -16,7 +16,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,13 @@ import numpy as np
 
 from benchmarks.report import Row, write_report
 from openarm_calibration.board.detect import guess_pose
+from openarm_calibration.handeye.choice import solve_chosen
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
-from openarm_calibration.handeye.kinematics import Kinematics
-from openarm_calibration.handeye.marks import Indices, fit_poses, project
+from openarm_calibration.handeye.left_out import column_squares
+from openarm_calibration.handeye.marks import Indices
 from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, chain
 from openarm_calibration.handeye.solve import SolveConfig, solve
-from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, solve_zeros
-from openarm_common import se3
+from openarm_calibration.handeye.zeros import ArmView, ZerosResult, arm_problem, solve_zeros
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
@@ -54,14 +54,6 @@ class RealSet:
     def setup(self) -> Setup:
         """Of its views."""
         return self.problem.views[0].setup
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """What one answer predicts: T_camera_board (n, 4, 4) of all views of the set, and its change of the intrinsics."""
-
-    T: Array
-    optics: Array
 
 
 def read_set(path: Path) -> RealSet:
@@ -94,55 +86,47 @@ def _poses(problem: Problem, X: Array, Z: Array) -> Array:
     return chain(problem, X[None] if X.ndim == 2 else X, Z[None] if Z.ndim == 2 else Z)[0]
 
 
-def fit_closed(real: RealSet, keep: Indices, method: str) -> Fit:
+def fit_closed(real: RealSet, keep: Indices, method: str) -> Array:
     """Answer with a closed form of the views `keep`."""
     part = real.problem.subset(keep)
     mounts = closed_form(method, real.setup, part.A, part.free)
-    return Fit(_poses(real.problem, mounts.X, mounts.Z), np.zeros((1, 6)))
+    return _poses(real.problem, mounts.X, mounts.Z)
 
 
-def fit_solver(real: RealSet, keep: Indices, config: SolveConfig) -> Fit:
+def fit_solver(real: RealSet, keep: Indices, config: SolveConfig) -> Array:
     """Answer with the solver."""
-    estimate = solve(real.problem.subset(keep), config).estimate
-    return Fit(_poses(real.problem, estimate.X, estimate.Z), estimate.optics)
+    answer = solve_chosen if config.misfit else solve
+    estimate = answer(real.problem.subset(keep), config).estimate
+    return _poses(real.problem, estimate.X, estimate.Z)
 
 
 def zeros_of(real: RealSet, keep: Indices, description: RobotDescription) -> ZerosResult:
     """Return the zeros by the views `keep`."""
-    return solve_zeros(description, [real.arm[i] for i in keep], real.problem.intrinsics, ZerosConfig(solver=_LAX))
+    return solve_zeros(description, [real.arm[i] for i in keep], real.problem.intrinsics)
 
 
-def fit_zeros(real: RealSet, keep: Indices, description: RobotDescription) -> Fit:
-    """Answer with zeros."""
+def fit_zeros(real: RealSet, keep: Indices, description: RobotDescription) -> Array:
+    """Answer with zeros, where the views show that they are off."""
     found = zeros_of(real, keep, description)
-    first = real.arm[0]
-    kinematics = Kinematics(description, first.base, first.tip, found.names)
-    A = np.array([kinematics.evaluate(view.q, found.values)[0] for view in real.arm])
+    if not found.off:
+        return fit_solver(real, keep, _LAX)
     estimate = found.solution.estimate
-    return Fit(_poses(replace(real.problem, A=A), estimate.X, estimate.Z), estimate.optics)
+    whole = arm_problem(description, real.arm, real.problem.intrinsics, found.names).posed(found.values)
+    return _poses(whole, estimate.X, estimate.Z)
 
 
-def left_out(real: RealSet, fit: Callable[[Indices], Fit]) -> Array:
+def left_out(real: RealSet, fit: Callable[[Indices], Array]) -> Array:
     """Return (n, 3) errors of each view, predicted by the others: px rms, m at the board's centre, rad."""
     problem = real.problem
-    out: list[tuple[float, float, float]] = []
-    for i, view in enumerate(problem.views):
+    out: list[Array] = []
+    for i in range(len(problem)):
         try:
-            found = fit(np.array([k for k in range(len(problem)) if k != i]))
+            T = fit(np.array([k for k in range(len(problem)) if k != i]))
         except OpenArmError:
-            out.append((math.nan, math.nan, math.nan))
+            out.append(np.full(3, math.nan))
             continue
-        row = problem.camera_rows(found.optics)[i]
-        T = found.T[i]
-        px = float(np.sqrt(np.mean(np.sum((project(view.points, view.radius, T, row) - view.pixels) ** 2, axis=1))))
-        own = fit_poses(
-            view.points, view.pixels, np.array([0, len(view.points)]), np.array([view.radius]),
-            problem.free[i : i + 1], row[None],
-        )[0][0]  # fmt: skip
-        centre = np.append(view.points.mean(axis=0), 1.0)
-        out.append(
-            (px, float(np.linalg.norm((T @ centre - own @ centre)[:3])), se3.angle_between(T[:3, :3], own[:3, :3]))
-        )
+        one = problem.subset([i])
+        out.append(np.sqrt(column_squares(one, T[i : i + 1], one.camera_rows())[0]))
     return np.array(out)
 
 
@@ -171,7 +155,7 @@ def main() -> None:
     for path in sorted(arguments.folder.glob("*.json")):
         real = read_set(path)
         print(f"{real.name}: {len(real.problem)} views, {real.setup}")
-        answers: dict[str, Callable[[Indices], Fit]] = {
+        answers: dict[str, Callable[[Indices], Array]] = {
             method: lambda keep, method=method, real=real: fit_closed(real, keep, method) for method in METHODS
         }
         answers["without misfit"] = lambda keep, real=real: fit_solver(real, keep, _BEFORE)

@@ -17,6 +17,7 @@ from openarm_calibration.handeye.marks import project
 from openarm_calibration.handeye.problem import Problem, chain, residuals
 from openarm_calibration.handeye.refine import mount_error, refine
 from openarm_calibration.handeye.unknowns import Solution, at_zeros
+from openarm_common import se3
 from openarm_common.errors import OpenArmError
 from openarm_common.types import Array
 
@@ -35,12 +36,14 @@ class Held:
         metres: The same at the board's distance.
         by_name: Both by view.
         marks: Mean squared distance of the marks in space, against the view's own pose of the board, by view, m².
+        squares: (views, 3) see `column_squares`.
     """
 
     px: float
     metres: float
     by_name: dict[str, tuple[float, float]]
     marks: dict[str, float] = field(default_factory=dict)
+    squares: Array = field(default_factory=lambda: np.full((1, 3), math.nan))
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
     folds = max(2, min(folds, len(poses)))
     squares: dict[str, tuple[float, float]] = {}
     marks: dict[str, float] = {}
+    columns: list[Array] = []
     for fold in range(folds):
         out = np.isin(problem.pose[used], poses[fold::folds])
         if len(np.unique(problem.pose[used[~out]])) < 3:
@@ -93,6 +97,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
         T, _ = chain(left, estimate.X, estimate.Z)
         rows = left.camera_rows(estimate.optics)
         in_space = in_space_squares(left, T)
+        columns.append(column_squares(left, T, rows))
         for k, view in enumerate(left.views):
             away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
             px = float(np.mean(np.sum(away**2, axis=1)))
@@ -103,7 +108,44 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
         return Held(math.nan, math.nan, {})
     px2, m2 = np.mean(list(squares.values()), axis=0)
     by_name = {name: (math.sqrt(a), math.sqrt(b)) for name, (a, b) in squares.items()}
-    return Held(math.sqrt(px2), math.sqrt(m2), by_name, marks)
+    return Held(math.sqrt(px2), math.sqrt(m2), by_name, marks, np.concatenate(columns))
+
+
+def column_squares(problem: Problem, T: Array, rows: Array) -> Array:
+    """Return (n, 3) squared errors of poses T (n, 4, 4): marks in the image, px; board's centre, m; angle, rad.
+
+    Args:
+        problem: The views; the last two are against their own poses of the board.
+        T: Predicted T_camera_board.
+        rows: (n, 6) of the cameras, see `Problem.camera_rows`.
+    """
+    out = np.zeros((len(problem), 3))
+    for k, view in enumerate(problem.views):
+        away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
+        centre, own = np.append(view.points.mean(axis=0), 1.0), problem.free[k]
+        out[k, 0] = np.mean(np.sum(away**2, axis=1))
+        out[k, 1] = np.sum(((T[k] - own) @ centre)[:3] ** 2)
+        out[k, 2] = se3.angle_between(T[k, :3, :3], own[:3, :3]) ** 2
+    return out
+
+
+def closed_columns(problem: Problem, method: str) -> Array:
+    """Return the rms errors (3,) of poses that a closed form did not see: px, m, rad; infinite where it has no answer.
+
+    Args:
+        problem: Of one camera and one board.
+        method: Name of the closed form.
+    """
+    squares: list[Array] = []
+    for pose in np.unique(problem.pose):
+        left, known = problem.subset(problem.pose == pose), problem.subset(problem.pose != pose)
+        try:
+            mounts = closed_form(method, known.views[0].setup, known.A, known.free)
+        except OpenArmError:
+            return np.full(3, math.inf)
+        T, _ = chain(left, mounts.X[None], mounts.Z[None])
+        squares.append(column_squares(left, T, left.camera_rows()))
+    return np.sqrt(np.concatenate(squares).mean(axis=0))
 
 
 def in_space_squares(problem: Problem, T: Array) -> Array:

@@ -181,7 +181,10 @@ def _degenerate(seen: Motion, noise: Noise, what: str) -> OpenArmError:
             f" {noise.translation * 1e3:.1f} mm and {math.degrees(noise.rotation):.2f}°"
             + (f", and their marks by {noise.view_px:.1f} px" if noise.misfit > _BAD_MISFIT else "")
         )
-        advice = "check the joint zeros, the intrinsics in camera_info, the size of the board, and that it did not move"
+        advice = (
+            "check the joint zeros (`openarm calibrate zeros`), the intrinsics in camera_info, the size of the board,"
+            " and that it did not move"
+        )
     else:
         cause = f"{seen.poses} poses that are too noisy or too far from the board"
     return OpenArmError(Code.DEGENERATE, f"{cause}: {what}; {advice}")

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from openarm_calibration.handeye.choice import solve_chosen
 from openarm_calibration.handeye.closed_form import REFINED, checked_algorithm, closed_form
 from openarm_calibration.handeye.left_out import side_by_side
 from openarm_calibration.handeye.observability import condition_number, require_motion
@@ -88,7 +89,7 @@ def calibrate(
         OpenArmError: DEGENERATE, with cause and advice; INVALID_ARGUMENT, for an unknown algorithm.
     """
     name = checked_algorithm(algorithm)
-    solution = solve(samples.problem(), config)
+    solution = solve_chosen(samples.problem(), config)
     if "intrinsics" in solution.estimate.extras:
         solution = _with_found_intrinsics(solution)
     return judged(samples, solution, algorithm=name, limits=limits, session=session, created=created, stored=stored)

@@ -136,7 +136,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         Check(
             "robot", arm.rotation / limits.robot,
             f"the hand seems off by {arm.translation * 1e3:.1f} mm and {math.degrees(arm.rotation):.2f}° from pose to"
-            " pose, as with wrong joint zeros; calibrate the zeros of the motors",
+            " pose, as with wrong joint zeros; find them by `openarm calibrate zeros`",
         ),
         Check(
             "contradictions", outliers / max(views, 1) / 0.1,

@@ -82,13 +82,19 @@ class Bench:
         camera: Which.
         seed: Of the true mounts.
         zeros: What is added to true joint positions, rad by name.
+        arm: That holds the board of a fixed camera; "": the last one.
     """
 
-    def __init__(self, camera: CameraConfig, seed: int, zeros: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self, camera: CameraConfig, seed: int, zeros: Mapping[str, float] | None = None, arm: str = ""
+    ) -> None:
         self._zeros = zeros or {}
-        self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load()
+        self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load().described
         scene = load_scene(f"{CALIBRATION}_{camera.name}")
         board = scene.fixtures[0]
+        if arm:
+            board = board.model_copy(update={"link": self._description.arm(arm).flange})
+            scene = scene.model_copy(update={"fixtures": (board,)})
         self._fixed = bool(board.link)
         self._carrier = board.link or camera.parent
         self._T_carrier_board = board.T_link_fixture
