@@ -3,7 +3,7 @@
 
 By its likelihood a misfit, which the marks of a view share, is right where lens or board bend the image, and wrong
 where a few large errors of the robot pass for it: it then buys pixels with degrees. Poses that are left out decide. The
-worst column of an answer counts (px, m, rad, each against the best closed form of that column): with a misfit it must be
+worst column of an answer counts (px, m, rad, each against the best closed form of it): with a misfit it must be
 better than the closed forms, or than without, by a standard error, else the simpler model is taken (the
 one-standard-error rule, Breiman et al. 1984, "Classification and Regression Trees"). m, rad, px.
 """
