@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The graph `real` with its emulation: grasp, motion, hardware node, frames, motors, physics, drawn cameras."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from openarm_interfaces.srv import ClearFaults, InjectFault
+
+from openarm_common.robot.description import RobotDescription
+from openarm_evaluation.judging.ros.observer import Observer
+from openarm_grasp.ros.client import GraspClient
+from openarm_motion.ros.client import MotionClient
+from tests.graph.asking import Asked
+
+pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
+
+
+@pytest.fixture(scope="module")
+def up(start_graph: Any) -> Any:
+    """The graph, ready, which lets a busy machine detect and answer late."""
+    settings = ("grasp.detect.max_age=3.0", "openarm_hardware.motors.silent=250")
+    graph = start_graph("real", "--emulate", *(word for setting in settings for word in ("--set", setting)))
+    graph.wait_ready()
+    return graph
+
+
+@pytest.mark.requirement("R-10", "A-25")
+def test_an_object_is_placed_through_frames_motors_and_physics(
+    up: Any, observer: Observer, client: GraspClient
+) -> None:
+    observer.wait(lambda: observer.truth(), 20.0, "ground truth")
+    result = client.pick("red", arm="right")
+    assert result.success, f"{result.code}: {result.message}"
+    place = observer.track("red_cube")[-1].p_world
+    assert np.hypot(*(place[:2] - result.place_position[:2])) < 0.02
+
+
+@pytest.mark.requirement("R-08")
+def test_a_motor_that_fails_in_the_lift_is_named_and_after_a_reset_the_arm_goes_on(
+    up: Any, observer: Observer, client: GraspClient
+) -> None:
+    joint = RobotDescription.load().arm_joints("right")[3]
+    observer.wait(lambda: observer.truth(), 20.0, "ground truth")
+    request = Asked(observer, lambda: client.pick("green", arm="right"))
+    request.wait_state("LIFT")
+    fault = InjectFault.Request(name="motor_fault", parameters=f"{{kind: error, joint: {joint}, value: 12}}")
+    answer = client.call(InjectFault, "/sim/inject_fault", fault)
+    assert answer.success, answer.message
+    result = request.result(60.0)
+    assert not result.success
+    assert joint in result.message
+    assert "rotor too hot" in result.message
+    client.call(ClearFaults, "/sim/clear_faults", ClearFaults.Request())
+    done = up.openarm("stop", "--reset")
+    assert "Traceback" not in done.stdout + done.stderr
+    assert client.release("right").success
+
+    deadline = time.monotonic() + 60.0
+    with MotionClient() as motion:
+        while not (home := motion.move_to_named("right", "home", hand_empty=True)).success:
+            assert time.monotonic() < deadline, home.message
