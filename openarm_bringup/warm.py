@@ -7,6 +7,8 @@ import numpy as np
 
 from openarm_calibration.warm import warm as warm_calibration
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.collision.self_collision import SelfCollision
+from openarm_common.robot.description import RobotDescription
 from openarm_motion.warm import warm as warm_motion
 from openarm_octomap.warm import warm as warm_octomap
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
@@ -23,12 +25,19 @@ def warm_perception() -> None:
         voxel_filter(deprojector.valid_points(depth, intrinsics), 0.01)
 
 
+def warm_hardware() -> None:
+    """Check a robot against itself once, as the node of the motors does."""
+    description = RobotDescription.load()
+    SelfCollision(description, [name for arm in description.arms.values() for name in arm.controlled])
+
+
 def main() -> None:
     """Warm all packages that have kernels."""
     warm_perception()
     warm_calibration()
     warm_motion()
     warm_octomap()
+    warm_hardware()
 
 
 if __name__ == "__main__":
