@@ -58,9 +58,11 @@ class CameraFeed:
                     wait_s = _RETRY_S
             except OpenArmError as error:
                 self.fault = error.message
+            except Exception as error:  # of a library: the camera is opened again, and what it was is said
+                self.fault = f"the camera failed: {error!r}"
             finally:
                 self.device = ""
-                with suppress(OpenArmError):
+                with suppress(Exception):
                     self._source.close()
             self._ends.wait(wait_s)
             wait_s = min(2.0 * wait_s, _RETRY_MOST_S)

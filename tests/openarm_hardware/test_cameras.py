@@ -142,6 +142,8 @@ class Scripted:
         if self.now == "good" or self.left > 0:
             self.left -= 1
             return Shot(1, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        if self.now == "broken":
+            raise RuntimeError("of a library")
         if self.now == "silent":
             return None
         raise OpenArmError(Code.NOT_READY, "unplugged")
@@ -152,13 +154,13 @@ class Scripted:
 
 def test_a_camera_that_is_absent_unplugged_or_silent_is_opened_again() -> None:
     came, enough = [], threading.Event()
-    camera = Scripted(["absent", "unplugged", "silent"])
+    camera = Scripted(["absent", "broken", "unplugged", "silent"])
     faults = set[str]()
 
     def take(shot: Shot) -> None:
         came.append(shot)
         faults.add(feed.fault)
-        if feed.opened == 3 and len(came) > 8:
+        if feed.opened == 4 and len(came) > 8:
             enough.set()
 
     feed = CameraFeed(camera, take, silent_s=0.5)
@@ -170,5 +172,5 @@ def test_a_camera_that_is_absent_unplugged_or_silent_is_opened_again() -> None:
         assert faults == {""}
     finally:
         feed.close()
-    assert camera.closed == 4
+    assert camera.closed == 5
     assert not feed.device
