@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Robot = Annotated[
     str | None,
-    Parameter(help="Name of a folder of models/robots; that of OPENARM_ROBOT, or openarm_v1, when not given."),
+    Parameter(help="Folder of models/robots, or the path of one; OPENARM_ROBOT, or openarm_v1, when not given."),
 ]
 
 Domain = Annotated[

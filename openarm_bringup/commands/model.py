@@ -11,7 +11,7 @@ from cyclopts import App
 from openarm_bringup.commands.connect import Robot
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.folder import choose_robot, robot_name
+from openarm_common.robot.folder import choose_robot, robot_folder, robot_name
 
 model = App(name="model", help="Write the robot for other tools; draft and check the folder of a robot.")
 
@@ -101,12 +101,12 @@ def semantics(name: str) -> Outcome:
     """Write the SRDF of a robot from its `semantics.yaml`, with a sampled collision matrix; takes minutes.
 
     Args:
-        name: Of the robot.
+        name: Of the robot, or the path of its folder.
     """
-    from openarm_common.robot.folder import load_folder
     from openarm_sim_bridge.drafting.semantics import write_srdf
 
-    path, reasons = write_srdf(load_folder(name)[0])
+    choose_robot(name)
+    path, reasons = write_srdf(robot_folder())
     count = {reason: list(reasons.values()).count(reason) for reason in sorted(set(reasons.values()))}
     always = sorted(" and ".join(sorted(pair)) for pair, reason in reasons.items() if reason == "Always")
     text = "\n".join(f"allowed, since they touch in every random state: {pair}" for pair in always)
@@ -119,12 +119,12 @@ def check(name: str) -> Outcome:
     """Say everything that is wrong with the folder of a robot: parts, meshes, limits, postures, contacts, MuJoCo.
 
     Args:
-        name: Of the robot.
+        name: Of the robot, or the path of its folder.
     """
-    from openarm_common.robot.folder import load_folder
     from openarm_sim_bridge.drafting.check import folder_faults
 
-    faults = folder_faults(load_folder(name)[0])
+    choose_robot(name)
+    faults = folder_faults(robot_folder())
     if faults:
         text = "\n".join(faults)
         message = f"{name}: {len(faults)} {'fault' if len(faults) == 1 else 'faults'}"

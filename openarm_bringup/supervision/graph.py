@@ -23,8 +23,8 @@ from openarm_bringup.supervision.parts import for_each_part
 from openarm_common.config import Config, ConfigT, load_yaml, parse_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
-from openarm_common.resources import config_dir, is_file, models_dir
-from openarm_common.robot.folder import robot_name
+from openarm_common.resources import config_dir, is_file
+from openarm_common.robot.folder import robot_folder
 
 ConditionKind = Literal["topic", "message", "service", "action"]
 
@@ -188,7 +188,7 @@ def graph_names() -> list[str]:
 
 
 def _folders() -> tuple[Path, Path]:
-    return models_dir() / "robots" / robot_name() / "graphs", config_dir() / "graphs"
+    return robot_folder() / "graphs", config_dir() / "graphs"
 
 
 def find_graph(name: str) -> Path:

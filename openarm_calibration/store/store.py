@@ -18,8 +18,7 @@ from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config, validate
 from openarm_common.errors import OpenArmError
 from openarm_common.records import Found, OfAnotherRobot, Record, RecordStore
-from openarm_common.resources import models_dir
-from openarm_common.robot.folder import robot_name
+from openarm_common.robot.folder import robot_folder
 from openarm_common.types import Array
 
 
@@ -158,7 +157,7 @@ def places(folder: Path, mount_seed: int | None) -> tuple[CalibrationStore, ...]
     stores = [CalibrationStore(folder)]
     if mount_seed is not None:
         name = f"mount_seed_{mount_seed}"
-        shipped = models_dir() / "robots" / robot_name() / "calibration"
+        shipped = robot_folder() / "calibration"
         stores += [CalibrationStore(folder / name), CalibrationStore(shipped / name)]
     return tuple(stores)
 

@@ -22,7 +22,7 @@ import xacro
 from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import is_file
-from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, other_robot, robot_name
+from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, other_robot, robot_folder, robot_name
 from openarm_common.robot.hand import Hand
 from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.meshes import take_meshes
@@ -89,7 +89,7 @@ class RobotDescription:
             OpenArmError: INVALID_ARGUMENT, listing the robots there are; CONFIG_INVALID, when a file of it is faulty.
         """
         mine = robot_name()
-        return _loaded(name or mine, zeros_path() if name in ("", mine) else "")
+        return _loaded(robot_folder(name), name or mine, zeros_path() if name in ("", mine) else "")
 
     @classmethod
     def from_folder(cls, name: str) -> RobotDescription:
@@ -422,13 +422,13 @@ class RobotDescription:
 
 
 @lru_cache(maxsize=8)
-def _loaded(name: str, zeros: str) -> RobotDescription:
+def _loaded(folder: Path, name: str, zeros: str) -> RobotDescription:
     """Return a robot with the zeros of a file; the file of a run is written once."""
     if zeros:
         held = read_zeros(Path(zeros))
         if text := other_robot(held.robot):
             raise OpenArmError(Code.CONFIG_INVALID, f"{zeros} {text}")
-        return _loaded(name, "").with_zeros(held.offsets)
+        return _loaded(folder, name, "").with_zeros(held.offsets)
     return RobotDescription.from_folder(name)
 
 

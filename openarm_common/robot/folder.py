@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import models_dir
+from openarm_common.resources import is_file, models_dir
 from openarm_common.robot.hand import HandParts
 from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.motors import JointMotion, Motors
@@ -23,7 +23,7 @@ from openarm_common.robot.zeros import zeros_path
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Names the robot of a process.
+#: Names the robot of a process: a folder of `models/robots`, or the path of one elsewhere.
 ROBOT = "OPENARM_ROBOT"
 DEFAULT = "openarm_v1"
 
@@ -116,18 +116,37 @@ class RobotFolder(Config):
         return self
 
 
-def robot_name() -> str:
-    """Return the name of this process's robot: of the environment variable `OPENARM_ROBOT`."""
+def robot_source() -> str:
+    """Return what names this process's robot: its name, or the path of a folder elsewhere."""
     return os.environ.get(ROBOT, "") or DEFAULT
+
+
+def robot_name() -> str:
+    """Return the name of this process's robot: of the folder that the environment variable `OPENARM_ROBOT` names."""
+    return robot_folder().name
+
+
+def robot_folder(name: str = "") -> Path:
+    """Return the folder of a robot of `models/robots`, or that of this process's robot, which may be elsewhere."""
+    folders, mine = models_dir() / "robots", robot_source()
+    return folders / (mine if name in ("", Path(mine).name) else name)  # a path that is absolute stays one
 
 
 def choose_robot(name: str | None) -> None:
     """Let the robot of this process, and of those that it starts, be another one; None leaves it.
 
+    Args:
+        name: Of a folder of `models/robots`, or the path of a robot's folder elsewhere.
+
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the robots there are.
     """
-    if name is not None:
+    if name is None:
+        return
+    elsewhere = Path(name).expanduser()
+    if name not in robot_names() and is_file(elsewhere / "robot.yaml"):
+        os.environ[ROBOT] = str(elsewhere.resolve())
+    else:
         _check_name(name)
         os.environ[ROBOT] = name
 
@@ -149,7 +168,7 @@ def per_robot(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def of_this_robot(*args: P.args, **kwargs: P.kwargs) -> R:
-        return made(models_dir() / "robots" / robot_name(), zeros_path(), *args, **kwargs)
+        return made(robot_folder(), zeros_path(), *args, **kwargs)
 
     return of_this_robot
 
@@ -161,7 +180,7 @@ def robot_names() -> tuple[str, ...]:
 
 def _check_name(name: str) -> None:
     if name not in robot_names():
-        text = f"no robot {name[:80]!r}; robots: {', '.join(robot_names())}"
+        text = f"no robot {name[:80]!r}; robots: {', '.join(robot_names())}, or the path of a folder with a robot.yaml"
         raise OpenArmError(Code.INVALID_ARGUMENT, text)
 
 
@@ -187,8 +206,9 @@ def load_folder(name: str) -> tuple[Path, RobotFolder]:
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the robots there are; CONFIG_INVALID, naming what is wrong.
     """
-    _check_name(name)
-    folder = models_dir() / "robots" / name
+    folder = robot_folder(name)
+    if name != robot_name() or not is_file(folder / "robot.yaml"):
+        _check_name(name)
     return folder, read_folder(folder)
 
 

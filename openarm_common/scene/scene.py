@@ -33,7 +33,7 @@ from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 from openarm_common.resources import is_file, models_dir
-from openarm_common.robot.folder import robot_name, robot_work
+from openarm_common.robot.folder import robot_folder, robot_work
 from openarm_common.robot.work import Table
 from openarm_common.types import Array
 
@@ -371,7 +371,7 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
 
 
 def _folders() -> tuple[Path, Path]:
-    return models_dir() / "robots" / robot_name() / "scenes", models_dir() / "scenes"
+    return robot_folder() / "scenes", models_dir() / "scenes"
 
 
 def random_scene(seed: int, count: int | None = None) -> Scene:

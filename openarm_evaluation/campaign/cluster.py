@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.folder import choose_robot, robot_name
+from openarm_common.robot.folder import choose_robot, robot_source
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import run_one, with_robot
@@ -75,7 +75,7 @@ def rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Genera
         make = ray.remote(num_cpus=1)(_Worker).remote
         local = replace(options, ray="", workers=1)
         queue, lost = list(reversed(seeds)), dict[int, int]()
-        idle = [make(robot_name(), robots) for _ in range(min(options.workers, len(seeds)))]
+        idle = [make(robot_source(), robots) for _ in range(min(options.workers, len(seeds)))]
         running: dict[Any, tuple[Any, int]] = {}
         while queue or running:
             while queue and idle:
@@ -91,7 +91,7 @@ def rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Genera
                     text = f"seed {seed}: {lost[seed]} workers were lost with it, the last: {error}"
                     raise OpenArmError(Code.EXECUTION_FAILED, f"{text}; the rows so far are kept") from error
                 queue.append(seed)
-                idle.append(make(robot_name(), robots))
+                idle.append(make(robot_source(), robots))
                 continue
             idle.append(worker)
             _check_versions(answer)

@@ -14,7 +14,7 @@ from cyclopts.validators import Number
 from openarm_bringup.commands.connect import Robot
 from openarm_common.camera.cameras import detector_nodes
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.folder import DEFAULT, robot_name
+from openarm_common.robot.folder import DEFAULT, robot_name, robot_source
 from openarm_evaluation.campaign.tasks.things import THINGS
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_sim_bridge.config import FaceName, Profile
@@ -165,7 +165,7 @@ class CampaignOptions:
             "./openarm campaign",
             f"--suite {self.set_name}" if self.set_name != "nominal" else "",
             f"--seeds {seed}",
-            f"--robot {robot_name()}" if robot_name() != DEFAULT else "",
+            f"--robot {robot_source()}" if robot_source() != DEFAULT else "",
         ]
         parts.append("--noise" if self.noise else "")
         parts.append("--mount-seeds " + ",".join(map(str, self.mount_seeds)) if self.mount_seeds else "")

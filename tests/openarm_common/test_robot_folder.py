@@ -6,9 +6,11 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
+from openarm_calibration.store.store import places
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
@@ -16,6 +18,10 @@ from openarm_common.robot import folder
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene import scene
 from openarm_common.scene.scene import Scene, load_scene, parse_scene
+from openarm_motion.config import MotionConfig
+from openarm_motion.planning.moves import RequestBoxes, to_joints
+from openarm_motion.service.motion_service import make_arms
+from openarm_sim_bridge.drafting.check import folder_faults
 
 
 @pytest.fixture
@@ -117,3 +123,23 @@ def test_a_table_that_stands_in_the_robot_is_refused(robots):
     altered(robots, work=work | {"least_x": 0.2})
     with pytest.raises(OpenArmError, match=r"stand in the robot: x is 0\.11, expected at least 0\.2"):
         folder.load_folder("mine")
+
+
+@pytest.mark.requirement("R-06")
+def test_a_robot_may_be_a_folder_anywhere(tmp_path, monkeypatch):
+    """By its path it is a robot as any other, called as its folder: description, scenes, calibration, plans."""
+    monkeypatch.setenv(folder.ROBOT, "")
+    mine = shutil.copytree(models_dir() / "robots" / "panda", tmp_path / "mine")
+    folder.choose_robot(str(mine))
+    assert (folder.robot_name(), folder.robot_folder(), folder.robot_source()) == ("mine", mine, str(mine))
+    robot = RobotDescription.load()
+    assert robot.name == "mine"
+    assert folder_faults(mine) == []
+    assert load_scene("demo").table.top_z == 0.45
+    assert {store.folder for store in places(tmp_path, 1)} >= {mine / "calibration" / "mount_seed_1"}
+    arm = make_arms(MotionConfig(), robot, [])["panda"]
+    home, ready = (robot.group_state("panda_arm", name) for name in ("home", "ready"))
+    now = arm.start_state(home | {robot.finger_joint("panda"): 0.0})
+    assert to_joints(arm, now, np.array([ready[name] for name in arm.names]), RequestBoxes()).duration > 0.1
+    with pytest.raises(OpenArmError, match=r"or the path of a folder with a robot\.yaml"):
+        folder.choose_robot(str(tmp_path))
