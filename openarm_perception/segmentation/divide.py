@@ -111,7 +111,7 @@ def divide(
     root = _join_small(root, patch, area, moments[:, 0], border, size, config)
     if rgb is not None and config.join_colors:
         root = join_alike(root, patch, border, rgb)
-    number = _number(root, patch, area, moments, support, config)
+    number = _number(root, patch, area, moments, support, intrinsics, config)
     return Divided(number[patch], patch, heights)
 
 
@@ -188,7 +188,13 @@ def _half_width(label: NDArray[np.int32], count: int) -> Array:
 
 
 def _number(
-    root: Labels, patch: Labels, area: Array, moments: Array, support: Support, config: SegmentationConfig
+    root: Labels,
+    patch: Labels,
+    area: Array,
+    moments: Array,
+    support: Support,
+    intrinsics: Intrinsics,
+    config: SegmentationConfig,
 ) -> NDArray[np.uint16]:
     """Return the numbers (n,) of the things that patches belong to, the largest first; 0 of what is none."""
     size = np.bincount(root, weights=area, minlength=len(root))
@@ -201,7 +207,7 @@ def _number(
         if size[i] < config.least_size**2 or count[i] < config.least_pixels or half_width[i] < _NARROW:
             continue
         members = np.nonzero((root == i) & (moments[:, 0] > 0.0))[0]
-        if support.share_over(centre[members[:: max(1, len(members) // _ASKED)]]) < _OVER:
+        if support.share_over(centre[members[:: max(1, len(members) // _ASKED)]], intrinsics) < _OVER:
             continue
         n += 1
         number[i] = n

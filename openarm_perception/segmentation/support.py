@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_perception.geometry.depth import Points
@@ -31,6 +32,9 @@ _SHARE = 0.1
 _STEEPEST = math.radians(25.0)
 #: Normals of points on the plane are within this of its own, rad.
 _NORMAL = math.radians(25.0)
+
+#: A plane may go on so far beyond the border of the image under what is no higher, m.
+_BEYOND, _LOW = 0.15, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +61,24 @@ class Support:
         """Return the heights of points (..., 3) over the plane, m; NaN of NaN."""
         return points @ self.normal.astype(np.float32) + np.float32(self.offset)
 
-    def share_over(self, points: Array) -> float:
-        """Return which share of points (n, 3) lies over what is seen of the plane, 0 to 1."""
-        flat = points @ self.axes
+    def share_over(self, points: Array, intrinsics: Intrinsics) -> float:
+        """Return which share of points (n, 3) lies over what is seen of the plane, 0 to 1.
+
+        Where the image ends, it is not seen how the plane goes on: what is low and near to the seen part counts, too.
+        """
+        if not len(points):
+            return 0.0
+        flat, height = points @ self.axes, points @ self.normal + self.offset
         along = np.roll(self.hull, -1, axis=0) - self.hull
-        # a convex outline: inside is on the same side of all its edges
+        turn = 1.0 if float(np.sum(self.hull[:, 0] * along[:, 1] - self.hull[:, 1] * along[:, 0])) > 0.0 else -1.0
         side = along[:, 0] * (flat[:, None, 1] - self.hull[:, 1]) - along[:, 1] * (flat[:, None, 0] - self.hull[:, 0])
-        return float(np.mean((side >= 0.0).all(axis=1) | (side <= 0.0).all(axis=1))) if len(points) else 0.0
+        # of a convex outline: how far outside of the worst of its edges
+        out = (-turn * side / np.maximum(np.linalg.norm(along, axis=1), 1e-9)).max(axis=1)
+        x, y, z = (points - height[:, None] * self.normal).T
+        depth = np.maximum(z, 1e-6)
+        u, v = intrinsics.fx * x / depth + intrinsics.cx, intrinsics.fy * y / depth + intrinsics.cy
+        unseen = (z <= 0.0) | (u < 0.0) | (v < 0.0) | (u >= intrinsics.width) | (v >= intrinsics.height)
+        return float(np.mean((out <= 0.0) | (unseen & (out <= _BEYOND) & (height <= _LOW))))
 
 
 def find_support(points: Points, up: Array | None = None) -> Support:
