@@ -235,14 +235,18 @@ def order(
         while ask := work.next():
             try:
                 result = client.pick(
-                    ask.label, exclude_near=ask.exclude_near, place_choices=ask.place_choices, timeout=timeout
+                    ask.label,
+                    phase=ask.phase,
+                    exclude_near=ask.exclude_near,
+                    place_choices=ask.place_choices,
+                    timeout=timeout,
                 )
             except KeyboardInterrupt:
                 data = {"placed": work.placed, "results": results}
                 return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED, data)
             seen = result.object_position
-            touched = result.attempts > 0
-            work.done(ask, result.code, result.message, result.place_position, seen, touched=touched)
+            how = {"touched": result.attempts > 0, "held": ask.phase != "place" and result.outcome == "PARTIAL"}
+            work.done(ask, result.code, result.message, result.place_position, seen, **how)
             row = {"label": ask.label, "position": seen and list(seen), "code": result.code, "message": result.message}
             results.append({**row, "place": list(result.place_position) if result.success else None})
             shown.print(f"{ask.label}: {result.code}: {result.message}", markup=False)

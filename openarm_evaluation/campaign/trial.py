@@ -128,7 +128,8 @@ class Trials:
         while ask := order.next():
             trial = self._grasp(ask)
             answer, touched = trial.answer, trial.answer.attempts > 0
-            order.done(ask, Code(answer.code), answer.message, *self._ends, touched=touched)
+            held = ask.phase != "place" and isinstance(answer, GraspOutcome) and answer.kind == "PARTIAL"
+            order.done(ask, Code(answer.code), answer.message, *self._ends, touched=touched, held=held)
             self._seconds += trial.sim_s
             if answer.success:
                 placed.append(trial)
@@ -145,8 +146,9 @@ class Trials:
     def _grasp(self, ask: GraspRequest) -> Trial:
         robot, task = self.robot, self._task
         began, first = time.monotonic(), len(self.steps)
-        for track in robot.tracks.values():
-            track.clear()
+        if ask.phase != "place":  # what is held has risen before
+            for track in robot.tracks.values():
+                track.clear()
         robot.pass_time(0.1)
         request = replace(ask, arm=task.arm, place=task.place)
         try:

@@ -25,6 +25,8 @@ _HEIGHT, _HEIGHT_SHARE = 0.008, 0.08
 _EXTENT, _EXTENT_SHARE = 0.015, 0.25
 #: A cluster with a smaller share of the points of the thing is a remainder of something else.
 _SAME_THING = 0.3
+#: What is lower than the thing was, by so much, m, or by this share of its height, is something else.
+_LOWER, _LOWER_SHARE = 0.015, 0.25
 #: Of the points of a thing that has not moved so many lie where it was, %: the rest may be the edge of the hand.
 _MOST = 85.0
 
@@ -105,7 +107,8 @@ def judge_gone(
                 continue
             if risen >= config.rise:
                 highest = max(highest, risen)
-            elif away <= match_radius:
+            # what it lay on, or leant against, shows when it has gone, and is lower
+            elif away <= match_radius and -risen <= max(_LOWER, _LOWER_SHARE * (before.top - _floor(before))):
                 text = f"something of its height still stands at its place ({away * 1e3:.0f} mm from it)"
                 return CameraVerdict(Code.GRASP_MISSED, text)
     text = f", and is seen {highest * 1e3:.0f} mm higher" if highest else ""

@@ -127,6 +127,7 @@ class Order:
     _stand: list[Spot] = field(default_factory=list[Spot])
     _ended: dict[str, int] = field(default_factory=dict[str, int])
     _in_vain: int = 0
+    _held: str = ""
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -145,17 +146,23 @@ class Order:
         """The next request; None when the order has ended."""
         if self.over:
             return None
+        if self._held:
+            return GraspRequest(f"{_FIRST} {self._held}", phase="place", place_choices=self._spots(self._held))
         for label in dict.fromkeys(self.labels):
             most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
             if label in self.failed or (most and self.placed.count(label) >= most):
                 continue
             if self._ended.get(label) == len(self.placed):
                 continue  # nothing has been taken away since
-            spots = () if self.bins is None else self.bins.bins[self.bins.of(label)].slots(self.bins.spacing)
             # whatever it was asked for as, what was placed or left is not asked for again
             left = (one.where for one in self.left if one.where is not None)
-            return GraspRequest(f"{_FIRST} {label}", exclude_near=(*self._stand, *left), place_choices=spots)
+            return GraspRequest(
+                f"{_FIRST} {label}", exclude_near=(*self._stand, *left), place_choices=self._spots(label)
+            )
         return None
+
+    def _spots(self, label: str) -> tuple[Spot, ...]:
+        return () if self.bins is None else self.bins.bins[self.bins.of(label)].slots(self.bins.spacing)
 
     @staticmethod
     def label_of(request: GraspRequest) -> str:
@@ -171,6 +178,7 @@ class Order:
         seen: Sequence[float] | None = None,
         *,
         touched: bool = False,
+        held: bool = False,
     ) -> None:
         """Note what came of a request.
 
@@ -181,9 +189,15 @@ class Order:
             placed: (x, y) where the object stands now, when it was placed.
             seen: (x, y) where it was seen, when it was.
             touched: An arm has moved for it.
+            held: A hand may hold it still: it is put down before anything else.
         """
         label = self.label_of(request)
         self.left = [one for one in self.left if one.label != label or one.where is not None]
+        placing, self._held = request.phase == "place", label if held else ""
+        if placing and code is Code.NOT_READY:
+            return  # no hand holds anything: it is where it was seen last
+        if placing and self.left and code is Code.OK:
+            self.left.pop()  # what was left in the hand
         self._in_vain = self._in_vain + 1 if touched and code is not Code.OK else 0
         if code is Code.OK:
             self.placed.append(label)

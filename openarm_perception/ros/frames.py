@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
@@ -71,7 +71,7 @@ class FrameBuilder:
 
     def __init__(self, topics: CameraTopics, limits: DepthLimits, depth_scale: float = 0.001) -> None:
         self._topics, self._limits, self._scale = topics, limits, depth_scale
-        self._newest: dict[str, Image | CameraInfo] = {}
+        self._newest: dict[str, Any] = {}
 
     def take(self, topic: str, message: Image | CameraInfo) -> Frame | None:
         """Take a message; returns a frame when it completes one.
@@ -82,7 +82,7 @@ class FrameBuilder:
         self._newest[topic] = message
         color, depth = self._newest.get(self._topics.color), self._newest.get(self._topics.depth)
         info = self._newest.get(self._topics.info)
-        if not isinstance(color, Image) or not isinstance(depth, Image) or not isinstance(info, CameraInfo):
+        if color is None or depth is None or info is None:
             return None
         if abs(stamp_to_ns(color.header.stamp) - stamp_to_ns(depth.header.stamp)) > _TOGETHER:
             return None

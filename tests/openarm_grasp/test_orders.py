@@ -100,6 +100,29 @@ def test_a_label_that_fails_in_vain_again_and_again_is_given_up():
     assert order.outcome == "FAILED"
 
 
+@pytest.mark.requirement("R-17")
+def test_what_a_hand_still_holds_is_put_down_before_anything_else():
+    order = Order(("anything",), BINS.model_copy(update={"rest": "right"}))
+    order.done(order.next(), Code.PLACE_FAILED, "the hand keeps it", seen=(0.3, 0.0), touched=True, held=True)
+    ask = order.next()
+    assert (ask.phase, ask.place_choices) == ("place", BINS.bins["right"].slots(BINS.spacing))
+    order.done(ask, Code.OK, "", placed=(0.22, -0.26))
+    assert order.placed == ["anything"]
+    assert order.left == []
+    order.done(order.next(), Code.GRASP_LOST, "it fell", seen=(0.3, 0.1), touched=True, held=True)
+    order.done(order.next(), Code.NOT_READY, "no hand holds anything")
+    ask = order.next()
+    assert (ask.phase, ask.exclude_near) == ("all", ((0.22, -0.26), (0.3, 0.1)))
+
+
+def test_a_hand_that_cannot_let_go_ends_the_order():
+    order = Order(("anything",))
+    order.done(order.next(), Code.PLACE_FAILED, "the hand keeps it", seen=(0.3, 0.0), touched=True, held=True)
+    order.done(order.next(), Code.PLACE_FAILED, "no free spot", touched=True)
+    assert order.next() is None
+    assert order.faults()[-1] == "anything: PLACE_FAILED: no free spot"
+
+
 def test_a_robot_that_is_lost_ends_the_order():
     order = Order(("red", "blue"))
     order.done(order.next(), Code.ROBOT_LOST, "silent")

@@ -73,6 +73,8 @@ def at(x, y, **changes):
         ([frame(), frame(at(0.28, -0.2))], Code.GRASP_MISSED, "still stands"),
         ([frame(at(0.27, -0.2, top=0.55))], Code.OK, "110 mm higher"),
         ([frame(at(0.27, -0.2, points=100))], Code.OK, "has gone"),
+        ([frame(at(0.27, -0.2, top=0.42))], Code.OK, "has gone"),  # what it lay on
+        ([frame(at(0.27, -0.2, top=0.43))], Code.GRASP_MISSED, "still stands"),
         ([frame(at(0.40, -0.3))], Code.OK, "has gone"),
         ([frame(in_view=False)], Code.STALE_DATA, "hides where the object was"),
         ([frame(in_view=False), frame()], Code.OK, "has gone"),
