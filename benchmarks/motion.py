@@ -152,7 +152,7 @@ def check_rows(both: DualArm, home: Mapping[str, float], count: int) -> list[Row
 
 def ros_rows(count: int) -> list[Row]:
     """A pose to the running node until its trajectory is back; the same node with another planner as the peer."""
-    times, peer = _through_ros("fast", count), _through_ros("ompl", count)
+    times, peer = _through_ros("fast", count)[0], _through_ros("ompl", count)[0]
     label = "the same node with OMPL RRTConnect and coal"
     return [
         Row("pose_to_trajectory_median_ms", _p(times, 50), "ms", "lower", 30.0, label, _p(peer, 50), len(times)),
@@ -160,7 +160,17 @@ def ros_rows(count: int) -> list[Row]:
     ]
 
 
-def _through_ros(planner: str, count: int) -> list[float]:
+def moveit_rows(count: int) -> list[Row]:
+    """A pose to /move_action until its trajectory is back; the suite's own action of the same node as the peer."""
+    peer, times = _through_ros("fast", count, moveit=True)
+    label, more = "/motion/move, the same poses", 3.0
+    return [
+        Row(f"moveit_{name}_ms", _p(times, p), "ms", "lower", _p(peer, p) + more, label, _p(peer, p), len(times))
+        for name, p in (("median", 50), ("p95", 95))
+    ]
+
+
+def _through_ros(planner: str, count: int, *, moveit: bool = False) -> tuple[list[float], list[float]]:
     from benchmarks.motion_ros import Client
 
     environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -176,7 +186,7 @@ def _through_ros(planner: str, count: int) -> list[float]:
     node = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         with Client(home) as client:
-            return client.measure(list(arms.values()), count)
+            return client.measure(list(arms.values()), count, moveit=moveit)
     finally:
         node.terminate()
         node.wait(10.0)
@@ -186,7 +196,9 @@ def main() -> None:
     """Run it all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer problems: within two minutes")
-    parser.add_argument("--only", default="", help="parts whose name begins so: ik, check, table, shelf, dual, ros")
+    parser.add_argument(
+        "--only", default="", help="parts whose name begins so: ik, check, table, shelf, dual, ros, moveit"
+    )
     parser.add_argument("--tuning", action="store_true", help="the problems that steps of the search were chosen on")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -218,6 +230,7 @@ def main() -> None:
         "shelf": lambda: single("shelf", shelf_problems(sides, home, *problems("shelf", 100, 10)), (10.0, 50.0)),
         "dual": lambda: plan_rows("dual", dual_problems(both, home, *problems("dual", 100, 10)), dual, (5.0, 50.0)),
         "ros": lambda: ros_rows(20 if quick else 200),
+        "moveit": lambda: moveit_rows(20 if quick else 200),
     }
     rows = [row for name, part in parts.items() if name.startswith(args.only) for row in part()]
     write_report(rows, args.json)

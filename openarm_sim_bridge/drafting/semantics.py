@@ -36,6 +36,7 @@ class SemanticsSource(Config):
     gripper: Mapping[str, float | Mapping[str, float]] = Field(
         default_factory=dict, description="position of the finger joint by posture, or by posture and arm; rad or m"
     )
+    aliases: Mapping[str, str] = Field(default_factory=dict, description="further names of groups, such as a client's")
     may_touch: tuple[tuple[str, str], ...] = Field(
         default=(), description="pairs of links whose shapes touch where the parts do not, or by design"
     )
@@ -126,10 +127,10 @@ def srdf_text(description: RobotDescription, source: SemanticsSource, reasons: M
         f'<robot name="{ET.fromstring(description.urdf).get("name", "")}">',
     ]
     disabled = [f'  <disable_collisions link1="{a}" link2="{b}" reason="{why}"/>' for (a, b), why in rows]
-    return "\n".join([*head, *_groups(description), *_states(description, source), *disabled, "</robot>", ""])
+    return "\n".join([*head, *_groups(description, source), *_states(description, source), *disabled, "</robot>", ""])
 
 
-def _groups(description: RobotDescription) -> list[str]:
+def _groups(description: RobotDescription, source: SemanticsSource) -> list[str]:
     """Groups, end effectors, passive joints."""
     lines: list[str] = []
     followers = {
@@ -146,6 +147,8 @@ def _groups(description: RobotDescription) -> list[str]:
     if len(description.arms) == 2:
         lines += ['  <group name="both_arms">', *(f'    <group name="{name}_arm"/>' for name in description.arms)]
         lines.append("  </group>")
+    for name, group in source.aliases.items():
+        lines += [f'  <group name="{name}">', f'    <group name="{group}"/>', "  </group>"]
     lines += [
         f'  <end_effector name="{name}_ee" parent_link="{description.arm(name).hand}" group="{name}_gripper"'
         f' parent_group="{name}_arm"/>'
