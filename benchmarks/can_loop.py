@@ -167,7 +167,7 @@ def beside(graph: str) -> Iterator[None]:
     def pick() -> None:
         while not ends.is_set():
             done = subprocess.run([*openarm, "pick", "red", *domain], capture_output=True, text=True, check=False)
-            print("beside:", done.stdout.strip().rpartition("\n")[2] or done.stderr.strip()[-200:], flush=True)
+            print("beside:", (done.stdout + done.stderr).strip()[:160].replace("\n", " "), flush=True)
 
     picks = threading.Thread(target=pick, daemon=True)
     try:
@@ -287,7 +287,7 @@ def main() -> None:
                     )
                     seen = int(np.isfinite(mine).sum())
                     rows.append(Row(f"{name} {label}, {rate:g} Hz", ours, "ms", "lower", goal, peer, peers, seen))
-    write_report(rows, options.json)
+        write_report(rows, options.json)
 
 
 if __name__ == "__main__":

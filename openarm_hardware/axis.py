@@ -46,7 +46,7 @@ class MotorAxis:
         self.share = 0.0
         self.asked = False
         self._target = (math.nan, 0.0)
-        #: Where the joint was when its reading last changed, and its command then.
+        #: Where the joint was when its reading last changed or was missing, and its command then.
         self._anchor = (math.nan, math.nan)
         self._left_s = 0.0
         self._seen_ns = 0
@@ -77,6 +77,8 @@ class MotorAxis:
 
     def account(self) -> None:
         """Count the reply that a frame should have had by now."""
+        if self.asked or self.q != self._anchor[0]:  # without a reply nothing is known of its position
+            self._anchor = (self.q, self.command[0])
         if self.asked:
             self.missed += 1
             self.lost += 1
@@ -191,12 +193,10 @@ class MotorAxis:
 
     def dead(self) -> str:
         """Return why its position can't be true, by what was commanded since it changed last; else nothing."""
-        if self.axis.grips or self.q != self._anchor[0]:
-            self._anchor = (self.q, self.command[0])
-        elif abs(self.command[0] - self._anchor[1]) > self._settings.stuck:
-            way = f"while its command went {self._settings.stuck:g} rad"
-            return f"{self.axis} stays at {self.q:.4f} {way}; is its encoder dead, or the joint blocked?"
-        return ""
+        if self.axis.grips or not abs(self.command[0] - self._anchor[1]) > self._settings.stuck:
+            return ""
+        way = f"while its command went {self._settings.stuck:g} rad"
+        return f"{self.axis} stays at {self.q:.4f} {way}; is its encoder dead, or the joint blocked?"
 
     @property
     def strays(self) -> str:

@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.motors import frames
+from openarm_common.motors.bus import Frame
 from openarm_hardware.arm import Phase
+from openarm_hardware.exchange import Command
 from tests.openarm_hardware.bench import PERIOD_NS, Bench
 
 pytestmark = pytest.mark.requirement("R-08")
@@ -169,6 +171,29 @@ def test_a_frozen_encoder_is_found_when_the_arm_moves() -> None:
     bench.until([Phase.DAMPED, Phase.HELD], 0.3)
     assert "one_4" in bench.machine.text
     assert "is its encoder dead" in bench.machine.text
+
+
+def test_motors_that_are_not_heard_of_for_a_while_are_not_taken_for_dead_encoders() -> None:
+    bench = Bench(silent=100, tracking=2.0).up()
+    since, start = bench.now_ns, [s.command for s in bench.machine.motors()]
+    bench.client = lambda: [
+        (q + (0.0 if a.grips else 1.0 * (bench.now_ns - since) * 1e-9), 1.0 if a.grips else 0.0)
+        for q, a in zip(start, bench.axes, strict=True)
+    ]
+    for _ in range(4):
+        bench.run(0.1)
+        kept = list[list[Frame]]([[], []])
+        for _ in range(60):  # an emulator that halts, and then answers all frames at once
+            sent = bench.machine.step(bench.now_ns, [[], []], bench.command)
+            if bench.commands % 3 == 0:
+                bench.command = Command(bench.now_ns, tuple(bench.client()))
+            bench.commands += 1
+            for mine, new, bus in zip(kept, sent, bench.machine.buses, strict=True):
+                mine.extend(bench.buses.take(bus, new, bench.now_ns))
+            bench.now_ns += PERIOD_NS
+        bench.waiting = kept
+    bench.run(0.05)
+    assert bench.phases == UP, bench.machine.text
 
 
 def test_a_joint_that_is_blocked_is_found_by_its_distance_from_the_command() -> None:
