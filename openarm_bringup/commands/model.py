@@ -31,7 +31,7 @@ def write(
 
     Args:
         kind: urdf (expanded), mjcf (as MuJoCo reads it) or srdf.
-        out: File to write; without one, the text is printed.
+        out: File to write, in which meshes are named from its folder; without one, the text is printed.
         render: PNG file for a picture of the robot in a scene.
         scene: mjcf and picture: name or path of a scene to put around the robot, or "random".
         seed: Seed of a random scene.
@@ -40,7 +40,7 @@ def write(
     choose_robot(robot)
     from openarm_sim_bridge.world.export import export, render_png
 
-    text = export(kind, scene, seed) if scene is None or kind == "mjcf" else export(kind)
+    text = export(kind, scene if kind == "mjcf" else None, seed, out.parent if out is not None else None)
     written: list[str] = []
     if render is not None:
         render_png(render, scene or "demo", view=view, seed=seed)

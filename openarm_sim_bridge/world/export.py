@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import os
+import re
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -15,10 +18,12 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Bytes
-from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, robot_spec
+from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, name_meshes, robot_spec
 from openarm_sim_bridge.world.world import start_qpos
 
 Kind = Literal["urdf", "mjcf", "srdf"]
+_ASSET = re.compile(r'(?<![a-z])file="([^"]*)"')
+_MESH_FILE = re.compile(r'filename="file://([^"]*)"')
 #: Views: point looked at (m, world), distance (m), azimuth and elevation (degrees) as MuJoCo counts them.
 VIEWS: Mapping[str, tuple[tuple[float, float, float], float, float, float]] = {
     "front": ((0.10, 0.0, 0.60), 1.75, 180.0, -10.0),
@@ -29,7 +34,7 @@ VIEWS: Mapping[str, tuple[tuple[float, float, float], float, float, float]] = {
 }
 
 
-def export(kind: Kind, scene: str | None = None, seed: int = 0) -> str:
+def export(kind: Kind, scene: str | None = None, seed: int = 0, folder: Path | None = None) -> str:
     """Return the description as text.
 
     Args:
@@ -37,6 +42,7 @@ def export(kind: Kind, scene: str | None = None, seed: int = 0) -> str:
             (MuJoCo writes six digits).
         scene: For MJCF: name or path of a scene to put around the robot, with the cameras; None is the robot alone.
         seed: Of the scene "random".
+        folder: In which the text will be: mesh files are named from there; None: by absolute paths.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for an unknown kind or a scene that the kind cannot hold; SCENE_INVALID.
@@ -45,7 +51,9 @@ def export(kind: Kind, scene: str | None = None, seed: int = 0) -> str:
     if scene is not None and kind != "mjcf":
         raise OpenArmError(Code.INVALID_ARGUMENT, f"a scene can be written as mjcf only, not as {kind}; leave it out")
     if kind == "urdf":
-        return description.urdf
+        if folder is None:
+            return description.urdf
+        return _MESH_FILE.sub(lambda m: f'filename="{_named(Path(m[1]), folder)}"', description.urdf)
     if kind == "srdf":
         return description.srdf
     if kind == "mjcf":
@@ -55,12 +63,23 @@ def export(kind: Kind, scene: str | None = None, seed: int = 0) -> str:
             spec = build_spec(description, load_scene(scene, seed), load_cameras())
         spec.compile()
         try:
-            return spec.to_xml()
+            return _with_files(spec.to_xml(), description, folder)
         except mujoco.FatalError as error:
             text = f"MuJoCo can't write scene {scene!r} as XML: {error}"
             hint = "objects with a texture and a scene with an appearance are for the simulation alone"
             raise OpenArmError(Code.SCENE_INVALID, f"{text} {hint}") from error
     raise OpenArmError(Code.INVALID_ARGUMENT, f"unknown kind {kind!r}; kinds: urdf, mjcf, srdf")
+
+
+def _with_files(mjcf: str, description: RobotDescription, folder: Path | None) -> str:
+    """Name the robot's mesh files in an MJCF by where they are; in memory they have other names."""
+    files = name_meshes(ET.fromstring(description.urdf))
+    return _ASSET.sub(lambda m: f'file="{_named(files[m[1]], folder)}"' if m[1] in files else m[0], mjcf)
+
+
+def _named(path: Path, folder: Path | None) -> str:
+    """How a file in a folder names another: from there; without one by its absolute path."""
+    return str(path) if folder is None else os.path.relpath(path, folder.absolute())
 
 
 def render(

@@ -188,19 +188,27 @@ def _import_urdf(description: RobotDescription) -> mujoco.MjSpec:
     return spec
 
 
-def _take_files(root: ET.Element) -> dict[str, bytes]:
-    """Read the mesh files of a URDF, and name each in it as the importer asks for it: one name a file and scale."""
-    assets, names = dict[str, bytes](), dict[tuple[str, str], str]()
+def name_meshes(root: ET.Element) -> dict[str, Path]:
+    """Name mesh files in a URDF as the importer asks for them, one name a file and scale; return the files by name."""
+    files, names = dict[str, Path](), dict[tuple[str, str], str]()
     for mesh in root.iter("mesh"):
         file, scale = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
         if (file, scale) not in names:
             path = Path(file.removeprefix("file://"))
             names[file, scale] = f"{len(names)}_{path.name}"
-            try:
-                assets[names[file, scale]] = path.read_bytes()
-            except OSError as error:
-                raise OpenArmError(Code.CONFIG_INVALID, f"can't read mesh {path}: {said(error)}") from error
+            files[names[file, scale]] = path
         mesh.set("filename", names[file, scale])
+    return files
+
+
+def _take_files(root: ET.Element) -> dict[str, bytes]:
+    """Read the mesh files of a URDF, as `name_meshes` names them."""
+    assets = dict[str, bytes]()
+    for name, path in name_meshes(root).items():
+        try:
+            assets[name] = path.read_bytes()
+        except OSError as error:
+            raise OpenArmError(Code.CONFIG_INVALID, f"can't read mesh {path}: {said(error)}") from error
     return assets
 
 

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import models_dir
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import ROBOT
 from openarm_common.scene.scene import PALETTE, load_scene
 from openarm_sim_bridge.world.export import VIEWS, export, render, render_png
 
@@ -48,6 +50,28 @@ def test_urdf_and_srdf_are_those_of_the_description_without_paths_of_this_machin
     RobotDescription.from_urdf(export("urdf"), export("srdf"))
     for kind in ("urdf", "srdf", "mjcf"):
         assert str(Path(__file__).parents[2]) not in export(kind)  # type: ignore[arg-type]
+
+
+@pytest.mark.requirement("A-12", "R-04")
+@pytest.mark.parametrize("robot", ["openarm_v2", "panda"])
+def test_files_of_a_robot_with_meshes_name_them_from_their_folder_and_are_read_again(
+    robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also through a link: what is written has no path of the machine, and is a whole robot."""
+    monkeypatch.setenv(ROBOT, robot)
+    (tmp_path / "robots").symlink_to(models_dir() / "robots")
+    description = RobotDescription.load()
+    for kind in ("urdf", "mjcf"):
+        text = export(kind, folder=models_dir())
+        assert str(models_dir()) not in text
+        assert f'"robots/{robot}/meshes/' in text
+        (tmp_path / f"robot.{kind}").write_text(text)
+    again = RobotDescription.from_files(tmp_path / "robot.urdf")
+    assert again.joints.keys() == description.joints.keys()
+    assert {name: len(link.meshes) for name, link in again.links.items()} == {
+        name: len(link.meshes) for name, link in description.links.items()
+    }
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "robot.mjcf")).nmesh > 10
 
 
 def test_what_cannot_be_exported_is_refused() -> None:
