@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No name of a robot's arms, links, joints, frames or cameras is in code outside its folder."""
+"""No name of a robot's arms, links, joints, frames or cameras is in code or on a page outside its folder."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ ROOT = Path(__file__).parents[1]
 #: Texts that are words of a language or of another library as well, by file.
 WORDS = {
     "openarm_common/wanted.py": {"left", "right"},  # of a request
-    "openarm_bringup/commands/pick.py": {"right"},  # justification of a column
+    "openarm_bringup/commands/pick.py": {"left", "right"},  # what remains; justification of a column
     "openarm_control/trajectory.py": {"right"},  # numpy.searchsorted
+    "openarm_evaluation/campaign/trial.py": {"left"},  # what remains
     "openarm_motion/timing/trajectory.py": {"right"},
     "openarm_perception/ros/stereo_node.py": {"left", "right"},  # cameras of a pair
     "openarm_perception/stereo/pairs.py": {"left", "right"},
@@ -58,12 +59,34 @@ def test_the_search_finds_names(tmp_path):
     assert not any("Of " in text for text in found)
 
 
+def all_names(robot: str, monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Names of links, joints, arms and cameras."""
+    monkeypatch.setenv(ROBOT, robot)
+    description = RobotDescription.load(robot)
+    return {*description.links, *description.joints, *description.arms, *load_cameras()} - {description.root}
+
+
+@pytest.mark.requirement("R-07", "B-13")
+@pytest.mark.parametrize("robot", robot_names())
+def test_no_name_of_a_robot_is_in_the_page_or_a_report(robot, monkeypatch):
+    """Texts and attributes in quotes, of what a browser shows; comments apart."""
+    names, hits = all_names(robot, monkeypatch), list[str]()
+    pages = [
+        path for kind in ("js", "html") for path in ROOT.glob(f"openarm_*/**/*.{kind}") if "vendor" not in path.parts
+    ]
+    assert len(pages) > 5
+    for path in pages:
+        text = re.sub(
+            r"/\*.*?\*/|^\s*//.*?$|<!--.*?-->", "", path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
+        )
+        hits += [f"{path.relative_to(ROOT)}: {q}" for q in re.findall(r"""["'`]([\w/]+)["'`]""", text) if q in names]
+    assert hits == []
+
+
 @pytest.mark.requirement("R-07", "B-13")
 @pytest.mark.parametrize("robot", robot_names())
 def test_no_name_of_a_robot_is_in_code(robot, monkeypatch):
-    monkeypatch.setenv(ROBOT, robot)
-    description = RobotDescription.load(robot)
-    names = {*description.links, *description.joints, *description.arms, *load_cameras()} - {description.root}
+    names = all_names(robot, monkeypatch)
     long = {name for name in names if "_" in name}
     hits = []
     for path in sorted(ROOT.glob("openarm_*/**/*.py")):

@@ -95,6 +95,7 @@ def make_server(host: str, on_end: Callable[[BaseException], None]) -> Iterator[
     from openarm_bringup.view.ros.page import GraphView
     from openarm_bringup.view.server import ViewServer
     from openarm_bringup.view.wire import robot_meshes, robot_shapes
+    from openarm_common.camera.cameras import spectator_camera
     from openarm_grasp.requests.states import State
 
     loop = asyncio.get_running_loop()
@@ -105,6 +106,8 @@ def make_server(host: str, on_end: Callable[[BaseException], None]) -> Iterator[
     hello = {
         "robot": robot_shapes(graph.description),
         "cameras": [camera.name for camera in graph.cameras],
+        "for_people": spectator_camera(),
+        "arms": graph.description.arm_names,
         "states": [state.value for state in State],
     }
     server = ViewServer(Guard(host), hello, graph, robot_meshes(graph.description))

@@ -25,7 +25,10 @@ const handlers = {
   hello(message) {
     showRobot(message.robot);
     grasp.setStates(message.states);
-    if (!$("cameras").children.length) makeCameras(message.cameras);
+    if (!$("cameras").children.length) {
+      makeCameras(message.cameras, message.for_people);
+      makeArms(message.arms);
+    }
     drawFloor();
     want();
   },
@@ -263,7 +266,15 @@ function makeLayers() {
   }
 }
 
-function makeCameras(names) {
+function makeArms(names) {
+  $("arms").hidden = names.length < 2;
+  for (const name of names) {
+    const input = element("input", { type: "radio", name: "arm", value: name });
+    $("arms").append(element("label", {}, input, element("span", { text: name })));
+  }
+}
+
+function makeCameras(names, closed) {
   for (const name of names) {
     const picture = element("img", { alt: `image of the ${name} camera` });
     const button = element("button", { type: "button", text: name });
@@ -278,7 +289,7 @@ function makeCameras(names) {
     button.addEventListener("click", () => set(figure.dataset.open !== "true"));
     picture.addEventListener("click", () => figure.classList.toggle("large"));
     $("cameras").append(figure);
-    set(name !== "spectator"); // rendered for people alone, so only when asked for
+    set(name !== closed); // rendered for people alone, so only when asked for
   }
 }
 
