@@ -24,9 +24,12 @@ normal is that of the pad); it is free when no point of the true surface is in t
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+os.environ.setdefault("MUJOCO_GL", "egl")
 
 import cv2
 import mujoco

@@ -27,7 +27,9 @@ _FIRST = "easiest"
 _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 #: There is no more of it in view.
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
-#: Requests of one label that moved an arm in vain, one after the other, until it is given up.
+#: With these the camera had not shown enough yet: another look may.
+_NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
+#: Requests that moved an arm in vain, or saw nothing, one after the other, until a label is given up.
 _IN_VAIN = 3
 
 
@@ -198,7 +200,8 @@ class Order:
             return  # no hand holds anything: it is where it was seen last
         if placing and self.left and code is Code.OK:
             self.left.pop()  # what was left in the hand
-        self._in_vain = self._in_vain + 1 if touched and code is not Code.OK else 0
+        unseen = seen is None and code in _NOT_SEEN
+        self._in_vain = self._in_vain + 1 if (touched or unseen) and code is not Code.OK else 0
         if code is Code.OK:
             self.placed.append(label)
             if len(placed) >= 2:
@@ -210,7 +213,7 @@ class Order:
         else:
             where = None if seen is None else (float(seen[0]), float(seen[1]))
             self.left.append(Left(label, where, code, message, len(self.placed)))
-            if where is None or self._in_vain >= _IN_VAIN:
+            if (where is None and not unseen) or self._in_vain >= _IN_VAIN:
                 self._ended[label], self._in_vain = len(self.placed), 0
 
     def _none_left(self, label: str, code: Code, message: str) -> None:

@@ -123,6 +123,17 @@ def test_a_hand_that_cannot_let_go_ends_the_order():
     assert order.faults()[-1] == "anything: PLACE_FAILED: no free spot"
 
 
+def test_a_camera_that_shows_nothing_is_asked_again_three_times_at_most():
+    order = Order(("red",))
+    order.done(order.next(), Code.STALE_DATA, "1 of 3 frames")
+    order.done(order.next(), Code.STALE_DATA, "1 of 3 frames")
+    order.done(order.next(), Code.OK, "", placed=(0.3, 0.2))
+    for _ in range(3):
+        order.done(order.next(), Code.STALE_DATA, "no frame")
+    assert order.next() is None
+    assert order.faults() == ("red: STALE_DATA: no frame",)
+
+
 def test_a_robot_that_is_lost_ends_the_order():
     order = Order(("red", "blue"))
     order.done(order.next(), Code.ROBOT_LOST, "silent")
