@@ -33,8 +33,8 @@ _STEEPEST = math.radians(25.0)
 #: Normals of points on the plane are within this of its own, rad.
 _NORMAL = math.radians(25.0)
 
-#: A plane may go on so far beyond the border of the image under what is no higher, m.
-_BEYOND, _LOW = 0.15, 0.25
+#: A plane that is seen this near to where the image ends goes on there, under what is no higher, m.
+_ROUND, _LOW = 0.03, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,21 +64,36 @@ class Support:
     def share_over(self, points: Array, intrinsics: Intrinsics) -> float:
         """Return which share of points (n, 3) lies over what is seen of the plane, 0 to 1.
 
-        Where the image ends, it is not seen how the plane goes on: what is low and near to the seen part counts, too.
+        What stands so near to the border of the image that its foot is not in it counts, too, where the plane is seen
+        at that border.
         """
         if not len(points):
             return 0.0
-        flat, height = points @ self.axes, points @ self.normal + self.offset
-        along = np.roll(self.hull, -1, axis=0) - self.hull
+        height, size = points @ self.normal + self.offset, np.array([intrinsics.width, intrinsics.height])
+        feet = points - height[:, None] * self.normal
+        known = (points[:, 2] > 0.0) & (feet[:, 2] > 0.0)
+        begin, end = (_pixels(np.where(known[:, None], p, 1.0), intrinsics) for p in (points, feet))
+        step = end - begin
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # the way to the foot leaves the image here, where it does
+            leaves = np.where(step > 0.0, (size - 1.0 - begin) / step, np.where(step < 0.0, -begin / step, np.inf))
+        share = np.clip(leaves.min(axis=1), 0.0, 1.0)
+        border = begin + share[:, None] * step
+        rays = np.column_stack(
+            [(border - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy), np.ones(len(points))]
+        )
+        facing = rays @ self.normal
+        there = rays * np.where(facing < -1e-9, -self.offset / np.minimum(facing, -1e-9), np.inf)[:, None]
+        cut = known & (share < 1.0) & (height <= _LOW) & np.isfinite(there).all(axis=1)
+        goes_on = self._outside(np.where(cut[:, None], there, 0.0)) <= _ROUND
+        return float(np.mean((self._outside(points) <= 0.0) | (cut & goes_on)))
+
+    def _outside(self, points: Array) -> Array:
+        """Return how far points (n, 3) are beyond the outline of what is seen of the plane, m (n,); negative inside."""
+        flat, along = points @ self.axes, np.roll(self.hull, -1, axis=0) - self.hull
         turn = 1.0 if float(np.sum(self.hull[:, 0] * along[:, 1] - self.hull[:, 1] * along[:, 0])) > 0.0 else -1.0
         side = along[:, 0] * (flat[:, None, 1] - self.hull[:, 1]) - along[:, 1] * (flat[:, None, 0] - self.hull[:, 0])
-        # of a convex outline: how far outside of the worst of its edges
-        out = (-turn * side / np.maximum(np.linalg.norm(along, axis=1), 1e-9)).max(axis=1)
-        x, y, z = (points - height[:, None] * self.normal).T
-        depth = np.maximum(z, 1e-6)
-        u, v = intrinsics.fx * x / depth + intrinsics.cx, intrinsics.fy * y / depth + intrinsics.cy
-        unseen = (z <= 0.0) | (u < 0.0) | (v < 0.0) | (u >= intrinsics.width) | (v >= intrinsics.height)
-        return float(np.mean((out <= 0.0) | (unseen & (out <= _BEYOND) & (height <= _LOW))))
+        return np.asarray((-turn * side / np.maximum(np.linalg.norm(along, axis=1), 1e-9)).max(axis=1))
 
 
 def find_support(points: Points, up: Array | None = None) -> Support:
@@ -175,3 +190,9 @@ def _vote(points: Array, normals: Array) -> tuple[Array, Array]:
     agree = (off <= band[:, None]) & (n @ normals[tried].T > math.cos(_NORMAL))
     best = int(np.argmax(np.count_nonzero(agree, axis=0)))
     return points[tried[best]], normals[tried[best]]
+
+
+def _pixels(points: Array, intrinsics: Intrinsics) -> Array:
+    """Return the pixels (n, 2) that points (n, 3) before the camera are seen at."""
+    focal, centre = (intrinsics.fx, intrinsics.fy), (intrinsics.cx, intrinsics.cy)
+    return np.asarray(points[:, :2] / np.maximum(points[:, 2:], 1e-6) * focal + centre)
