@@ -27,6 +27,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -211,10 +212,13 @@ class Bench:
 
     def _reset(self) -> dict[str, Any]:
         """Reset until the arms follow; return how long it took, and how far a joint moved."""
+        now_ns = time.time_ns()
+        with suppress(OpenArmError):  # what motors without power did is not of the reset
+            self._observer.wait(lambda: self._newest() > now_ns or None, 3.0, "joint states")
         before = self._observer.joints()[-1][1]
         began = time.monotonic()
         ok = b"\0"
-        while self._observer.level != ok or time.monotonic() - began < 1.2:  # a report that is newer than the fault
+        while self._observer.level != ok or time.monotonic() - began < 1.5:  # a report that is newer than the fault
             if time.monotonic() - began > 40.0:
                 return {"reset_s": float("nan"), "moved_rad": float("nan"), "left": self._observer.text}
             if self._observer.level != ok:
