@@ -111,8 +111,8 @@ def load_wiring(robot: str | None = None) -> Wiring:
     Raises:
         OpenArmError: CONFIG_INVALID, naming what is missing or wrong.
     """
-    folder, _ = load_folder(robot or robot_name())
-    path = folder / "hardware.yaml"
+    folder, parts = load_folder(robot or robot_name())
+    path = folder / parts.hardware
     if not path.is_file():
         text = f"{path}: missing; it says which motor drives which joint, so nothing can be sent to this robot's motors"
         raise OpenArmError(Code.CONFIG_INVALID, text)

@@ -75,6 +75,7 @@ class RobotFolder(Config):
         hand: What the fingers of each arm can do; None: nothing is known of them.
         motion: What plans ask of the joints of an arm; None: parameters of the motion node say it.
         motors: Of each arm; None: it is not simulated.
+        hardware: YAML of the motors on CAN, where the robot is one that has them; it may be another robot's.
         arms: By name; the group of each in the SRDF is `NAME_arm`.
         lift: That carries all arms; None: they stand on the base.
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
@@ -89,6 +90,7 @@ class RobotFolder(Config):
     hand: HandParts | None = None
     motion: JointMotion | None = None
     motors: Motors | None = None
+    hardware: str = "hardware.yaml"
     arms: Mapping[str, ArmParts] = Field(min_length=1)
     lift: LiftParts | None = None
     mirror: tuple[float, ...] = ()

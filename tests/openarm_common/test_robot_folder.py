@@ -13,6 +13,7 @@ import yaml
 from openarm_calibration.store.store import places
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.motors.wiring import load_wiring
 from openarm_common.resources import models_dir
 from openarm_common.robot import folder
 from openarm_common.robot.description import RobotDescription
@@ -143,3 +144,18 @@ def test_a_robot_may_be_a_folder_anywhere(tmp_path, monkeypatch):
     assert to_joints(arm, now, np.array([ready[name] for name in arm.names]), RequestBoxes()).duration > 0.1
     with pytest.raises(OpenArmError, match=r"or the path of a folder with a robot\.yaml"):
         folder.choose_robot(str(tmp_path))
+
+
+def test_motors_on_can_are_those_that_are_simulated(monkeypatch):
+    """Gains of `hardware.yaml` are those of `robot.yaml`; a robot with the motors of another names its file."""
+    found = {}
+    for name in ("openarm_v1", "openarm_v2", "openarm_v2_cell"):
+        monkeypatch.setenv(folder.ROBOT, name)
+        found[name], motors = load_wiring(), folder.load_folder(name)[1].motors
+        assert motors is not None
+        assert found[name].joints.stiffness == motors.gains.stiffness
+        assert found[name].joints.damping == motors.gains.damping
+    assert found["openarm_v2_cell"] == found["openarm_v2"]
+    monkeypatch.setenv(folder.ROBOT, "panda")
+    with pytest.raises(OpenArmError, match=r"hardware\.yaml: missing"):
+        load_wiring()
