@@ -85,7 +85,7 @@ def _of_pairs(path: Path, form: str, given: Foreign) -> Outcome:
     from openarm_common.records import now
 
     read = read_easy_handeye2 if form == "easy_handeye2" else read_moveit
-    file = read(path, given.camera_kind)
+    file = read(path, given.camera_kind or "")
     names = Names(given.camera, given.base or file.base or "base", given.tip or file.tip or "tip")
     result = pair_result(file.pairs, names, created=now())
     message = f"{result.grade}: {'; '.join(result.reasons) or 'within all limits'}"
@@ -103,7 +103,7 @@ def _of_csv(path: Path, given: Foreign) -> Outcome:
     from openarm_calibration.foreign.image_sets import Given, Names, image_set
     from openarm_calibration.foreign.pose_files import kind_of, read_table
 
-    setup = kind_of(given.camera_kind, "a CSV")
+    setup = kind_of(given.camera_kind or "", "a CSV")
     for name, value in (("images", given.images), ("board", given.board), ("intrinsics", given.intrinsics)):
         if not value:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"a CSV of poses needs --{name}; it has none of its own")
@@ -111,7 +111,7 @@ def _of_csv(path: Path, given: Foreign) -> Outcome:
     found = image_set(
         read_table(path), given.images, given_board(given.board), lens_given(given.intrinsics), setup,
         Names(given.camera, given.base or "base", given.tip or "tip"),
-        Given(given.rotation or None, given.unit or None, given.frames or None),
+        Given(given.rotation, given.unit, given.frames),
     )  # fmt: skip
     tried = [
         {"convention": one.convention.text, "translation": one.translation, "rotation": one.rotation}

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from openarm_calibration.foreign.optics import Lens
 
 Format = Literal["auto", "easy_handeye2", "moveit", "csv", "bag"]
-CameraKind = Literal["", "eye_in_hand", "eye_to_hand"]
+CameraKind = Literal["eye_in_hand", "eye_to_hand"]
+Rotation = Literal["xyzw", "wxyz", "rotvec", "rotvec_deg", "rpy", "rpy_deg", "abc_deg", "matrix"]
 
 
 @Parameter(name="*")
@@ -44,16 +45,16 @@ class Foreign:
         save: Store the result, unless it fails.
     """
 
-    camera_kind: CameraKind = ""
+    camera_kind: CameraKind | None = None
     camera: str = "camera"
     base: str = ""
     tip: str = ""
     board: str = ""
     images: Path | None = None
     intrinsics: str = ""
-    rotation: Literal["", "xyzw", "wxyz", "rotvec", "rotvec_deg", "rpy", "rpy_deg", "abc_deg", "matrix"] = ""
-    unit: Literal["", "m", "mm"] = ""
-    frames: Literal["", "T_base_tip", "T_tip_base"] = ""
+    rotation: Rotation | None = None
+    unit: Literal["m", "mm"] | None = None
+    frames: Literal["T_base_tip", "T_tip_base"] | None = None
     image_topic: str = ""
     info_topic: str = ""
     joint_topic: str = ""

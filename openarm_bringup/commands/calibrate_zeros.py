@@ -22,6 +22,7 @@ def zeros(
     *samples: Path,
     sigma: float | None = None,
     prior: tuple[str, ...] = (),
+    page: Path | None = None,
     save: bool = False,
     force: bool = False,
     domain: Domain = None,
@@ -36,13 +37,16 @@ def zeros(
             given.
         sigma: Deviation of a zero before anything is seen, degrees; the likeliest one when not given.
         prior: The same of single joints, as joint=degrees; 0: its zero is right.
+        page: HTML file to write: each joint, and each sample without the zeros and with them.
         save: Store zeros and mounts, unless they predict left-out samples no better than the present ones.
         force: Store them all the same.
     """
     from openarm_calibration.handeye.zero_sets import calibrate_zeros
     from openarm_calibration.handeye.zeros import ZerosConfig
+    from openarm_calibration.report.report import zeros_page
     from openarm_common.config import validate
     from openarm_common.records import now
+    from openarm_common.resources import write_whole
 
     given = {
         "sigma": None if sigma is None else math.radians(sigma),
@@ -56,6 +60,9 @@ def zeros(
             read = [opened(_of_graph(Path(folder), domain), source)[:2]]
     found = calibrate_zeros([one for one, _ in read], config, hashes=[digest for _, digest in read], created=now())
     text, data = _text(found), found.as_json()
+    if page is not None:
+        data["page"] = str(page)
+        write_whole(page, zeros_page(found).encode())
     if found.failures and not force:
         return Outcome(False, f"{'; '.join(found.failures)}; nothing was stored", Code.DEGENERATE, data, text)
     message = "; ".join((*found.failures, *found.warnings)) or "left-out samples are predicted better with the zeros"

@@ -42,10 +42,17 @@ _OUTLIERS = 0.1
 
 @dataclass(frozen=True)
 class Predicted:
-    """Median over poses that an answer did not see of the rms error of marks: in the image, px, and in space, m."""
+    """Errors of the marks of poses that an answer did not see: in the image, px, and in space, m.
+
+    Args:
+        px: Median over the poses of the rms.
+        metres: The same.
+        by_name: Rms of both by view.
+    """
 
     px: float
     metres: float
+    by_name: dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +207,7 @@ def _predicted(
     start: Solution | None,
 ) -> Predicted:
     """Return the errors of poses that are left out in turn."""
-    px: list[float] = []
-    space: list[float] = []
+    by_name: dict[str, tuple[float, float]] = {}
     for fold in range(min(_FOLDS, len(views))):
         kept = [view for k, view in enumerate(views) if k % _FOLDS != fold]
         found = solve_zeros(described, kept, optics, config, start)
@@ -210,11 +216,12 @@ def _predicted(
         problem = arm_problem(described, left, optics, found.names).posed(estimate.zeros)
         T, _ = chain(problem, estimate.X, estimate.Z)
         rows = problem.camera_rows(estimate.optics)
-        space += in_space_squares(problem, T).tolist()
+        space = in_space_squares(problem, T)
         for k, view in enumerate(problem.views):
             away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
-            px.append(float(np.mean(np.sum(away**2, axis=1))))
-    return Predicted(math.sqrt(float(np.median(px))), math.sqrt(float(np.median(space))))
+            by_name[view.name] = float(np.sqrt(np.mean(np.sum(away**2, axis=1)))), float(np.sqrt(space[k]))
+    px, metres = np.median(list(by_name.values()), axis=0).tolist()
+    return Predicted(px, metres, by_name)
 
 
 def _mount(

@@ -31,8 +31,9 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.urdf import Joint
 from openarm_common.types import Array
 
-#: Deviations of the offsets that are compared, the widest first; the last one says that zeros are right, rad.
-_SCALES = tuple(math.radians(degrees) for degrees in (4.0, 2.0, 1.0, 0.5, 0.25, 0.1, 0.03, 0.001))
+#: Deviations of the offsets that are compared, rad; the first says that zeros are right. Each answer starts from the
+#: one before: from the wide end, joints that mounts take up would wander and come back slowly.
+_SCALES = tuple(math.radians(degrees) for degrees in (0.001, 0.03, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0))
 #: Twice the logarithm of the likelihood ratio from which the zeros count as wrong: very strong evidence (Kass and
 #: Raftery 1995, "Bayes factors").
 _EVIDENT = 10.0
@@ -105,7 +106,7 @@ class ZerosResult:
     @property
     def off(self) -> bool:
         """Whether the samples show that zeros are off at all, where that was to be found out."""
-        return bool(self.prior.max(initial=0.0) > _SCALES[-1])
+        return bool(self.prior.max(initial=0.0) > _SCALES[0])
 
     @property
     def told(self) -> tuple[bool, ...]:
@@ -165,7 +166,7 @@ def _parameters(
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"a prior for {name!r}, which moves nothing here; joints: {', '.join(joints)}"
             )
-    names, sigma = list(joints), [config.by_joint.get(name, config.sigma or _SCALES[0]) for name in joints]
+    names, sigma = list(joints), [config.by_joint.get(name, config.sigma or _SCALES[-1]) for name in joints]
     if config.lengths is not None:
         long = [name for name in joints if _has_length(description.joint(name))]
         names += [f"{name} length" for name in long]
@@ -225,13 +226,14 @@ def solve_zeros(
     # views that contradict the others may do so by the zeros alone, as long as these are not known
     trusting = solver.model_copy(update={"reject_outliers": False})
     answers: list[tuple[Array, Solution]] = []
-    for scale in _SCALES if config.sigma is None else (config.sigma,):
+    given = () if config.sigma is None else (config.sigma,)
+    for scale in _SCALES if not given else given if start is not None else (_SCALES[0], *given):
         _, sigma = _parameters(description, views, config.model_copy(update={"sigma": scale}))
         start = solve(problem, trusting, Priors(zeros=sigma), start=start)
         answers.append((sigma, start))
-    prior, solution = min(answers, key=lambda answer: answer[1].estimate.evidence)
-    if not solution.estimate.evidence < answers[-1][1].estimate.evidence - _EVIDENT:
-        prior, solution = answers[-1]
+    prior, solution = answers[-1] if given else min(answers, key=lambda answer: answer[1].estimate.evidence)
+    if not given and not solution.estimate.evidence < answers[0][1].estimate.evidence - _EVIDENT:
+        prior, solution = answers[0]
     if solver.reject_outliers:
         solution = solve(problem, solver, Priors(zeros=prior), start=solution)
     estimate, covariance = solution.estimate, solution.estimate.covariance()

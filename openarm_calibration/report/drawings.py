@@ -30,6 +30,8 @@ _WIDE = 912.0
 _FRUSTUM = 0.04
 #: Length that the rms of the residuals is drawn with, px.
 _DRAWN_RMS = 12.0
+#: Longest arrow on an image, px.
+_LONGEST = 120.0
 
 
 class Drawing(NamedTuple):
@@ -60,14 +62,8 @@ def residuals(result: Result) -> Drawing:
     """Draw the residual of each mark, enlarged."""
     from matplotlib.collections import LineCollection
 
-    problem, estimate = result.solution.problem, result.solution.estimate
-    away = {
-        k: residual
-        for k, residual in enumerate(problem_residuals(problem, estimate.X, estimate.Z))
-        if result.solution.used[k]
-    }
-    rms = float(np.sqrt(np.mean(np.concatenate(list(away.values())) ** 2)))
-    zoom = _DRAWN_RMS / max(rms, 1e-6)
+    problem = result.solution.problem
+    away, rms, zoom = _away(result)
     axes = sheet(problem.intrinsics[0].width, problem.intrinsics[0].height)
     for k, residual in away.items():
         pixels, colour = problem.views[k].pixels, hue(k, len(problem))
@@ -75,6 +71,36 @@ def residuals(result: Result) -> Drawing:
         axes.add_collection(LineCollection([*segments], color=colour, lw=1.5))
         axes.plot(*pixels.T, "o", ms=3.0, mew=0.0, color=colour)
     return _drawing(axes, f"residuals of the fit, {zoom:.0f} times enlarged; rms {rms:.3f} px per axis")
+
+
+def _away(result: Result) -> tuple[dict[int, Array], float, float]:
+    """Return measured minus predicted pixels (marks, 2) of the views that were used, their rms, and how far to zoom."""
+    problem, estimate = result.solution.problem, result.solution.estimate
+    every = enumerate(problem_residuals(problem, estimate.X, estimate.Z))
+    away = {k: residual for k, residual in every if result.solution.used[k]}
+    rms = float(np.sqrt(np.mean(np.concatenate(list(away.values())) ** 2)))
+    return away, rms, _DRAWN_RMS / max(rms, 1e-6)
+
+
+class Arrows(NamedTuple):
+    """From marks of an image to where the answer has them, (marks, 2) px, enlarged by `zoom`; the true rms, px."""
+
+    away: list[list[float]]
+    rms: float
+    zoom: float
+
+
+def arrows(result: Result) -> dict[str, Arrows]:
+    """Return the arrows of each sample, also of those that were left out; longer ones are cut."""
+    problem, estimate = result.solution.problem, result.solution.estimate
+    _, _, zoom = _away(result)
+    out: dict[str, Arrows] = {}
+    for view, residual in zip(problem.views, problem_residuals(problem, estimate.X, estimate.Z), strict=True):
+        lengths = np.linalg.norm(residual, axis=1, keepdims=True) * zoom
+        cut = np.minimum(1.0, _LONGEST / np.maximum(lengths, 1e-9))
+        drawn = np.nan_to_num(-zoom * residual * cut)
+        out[view.name] = Arrows(drawn.tolist(), float(np.sqrt(np.mean(residual**2))), zoom)
+    return out
 
 
 def poses(samples: SampleSet, result: Result) -> Drawing:

@@ -11,6 +11,7 @@ import math
 from pathlib import Path
 
 from openarm_calibration.handeye.offline import Result
+from openarm_calibration.handeye.zero_sets import ZerosCalibration
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.figures import data_uri, render_page
 
@@ -46,6 +47,16 @@ def summary(result: Result) -> str:
     return "\n".join(lines)
 
 
+def zeros_page(found: ZerosCalibration) -> str:
+    """Return the HTML page of joint zeros: each joint, and each sample without the zeros and with them."""
+    return render_page(
+        Path(__file__).with_name("zeros.html"),
+        **{name: getattr(found, name) for name in ("zeros", "mounts", "before", "after", "failures", "warnings")},
+        outliers={outlier.name: outlier.reason for outlier in found.result.solution.outliers},
+        degrees=math.degrees,
+    )
+
+
 def page(samples: SampleSet, result: Result) -> str:
     """Return the HTML page."""
     from openarm_calibration.report import drawings
@@ -62,6 +73,9 @@ def page(samples: SampleSet, result: Result) -> str:
         poses=drawings.poses(samples, result),
         coverage=drawings.coverage(samples),
         residuals=drawings.residuals(result),
+        arrows=(arrows := drawings.arrows(result)),
+        zoom=next(iter(arrows.values())).zoom,
+        zip=zip,
         hue=drawings.hue,
         data_uri=data_uri,
         degrees=math.degrees,

@@ -60,8 +60,12 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict]:
 def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_back(
     capsys, sessions: list[str], tmp_path: Path
 ) -> None:
-    code, answer = run(capsys, "zeros", *sessions, "--save")
+    page = tmp_path / "zeros.html"
+    code, answer = run(capsys, "zeros", *sessions, "--save", "--page", str(page))
     assert code == 0, answer["message"]
+    text = page.read_text()
+    assert text.count("the prior decides") == 4
+    assert all(name in text for name in (*zeros_of_both(), "overhead_1/s001", "wrist_3/s014"))
     data, truth = answer, zeros_of_both()
     zeros = data["zeros"]
     assert set(zeros["by_prior"]) == {f"openarm_{arm}_joint{k}" for arm in ("right", "left") for k in (1, 7)}

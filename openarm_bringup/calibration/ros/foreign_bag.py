@@ -52,7 +52,7 @@ def samples_of_foreign(bag: Bag, board: Board, given: Foreign) -> tuple[SampleSe
     Raises:
         OpenArmError: INVALID_ARGUMENT, when a topic, a link or an option is missing, with those that there are.
     """
-    setup = kind_of(given.camera_kind, "a bag")
+    setup = kind_of(given.camera_kind or "", "a bag")
     images = _topic(bag, "image_topic", given.image_topic, (_IMAGE, _COMPRESSED), without="depth")
     with contents(bag):
         lens = _lens(bag, images, given)
