@@ -83,8 +83,8 @@ class TrueMeshes:
         #: Height of the robot's stand, m.
         self.stand = float(description.link_pose(arm.base, {})[2, 3])
 
-    def around(self, obstacles: Sequence[Solid]) -> Callable[[Array], bool]:
-        """Whether a configuration (n,) hits itself or obstacles."""
+    def around(self, obstacles: Sequence[Solid], margin: float = 0.0) -> Callable[[Array], bool]:
+        """Whether a configuration (n,) comes as near as `margin`, m, to itself or obstacles."""
         geometry = self._robot.copy()
         links = [k for k, o in enumerate(geometry.geometryObjects) if o.parentJoint > 0]
         for body in obstacles:
@@ -92,6 +92,8 @@ class TrueMeshes:
             for link in links:
                 geometry.addCollisionPair(pin.CollisionPair(link, k))
         data, q = pin.GeometryData(geometry), np.array(pin.neutral(self._model))
+        for request in data.collisionRequests:
+            request.security_margin = margin
 
         def hits(configuration: Array) -> bool:
             q[self._rows] = configuration

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
-from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL
+from openarm_common.collision.kernel import kernel
+from openarm_common.collision.shape_kernels import BOX, HULL, SPHERE
 from openarm_common.types import Array, Ints
 
 #: Steps at most; shapes that touch take the most.
@@ -20,96 +19,60 @@ _STEPS = 40
 _CLOSE, _ZERO = 1e-3, 1e-14
 
 
-@njit(cache=True, nogil=True)
-def _corner(
-    k: int, kinds: Ints, sizes: Array, corners: Array, firsts: Ints, x: float, y: float, z: float, at: Array
-) -> None:
-    """Put the furthest point of a shape along a direction of its frame into `at` (3,); of a sphere, the centre."""
-    kind = kinds[k]
-    if kind == HULL:
-        best, most = firsts[k], -math.inf
-        for c in range(firsts[k], firsts[k + 1]):
+@kernel
+def _climb(tip: int, corners: Array, firsts: Ints, rings: Ints, x: float, y: float, z: float) -> int:
+    """The corner of a hull that is furthest along a direction of its frame, by edges that lead there from `tip`."""
+    most = corners[tip, 0] * x + corners[tip, 1] * y + corners[tip, 2] * z
+    while True:
+        best = tip
+        for r in range(firsts[tip], firsts[tip + 1]):
+            c = rings[r]
             along = corners[c, 0] * x + corners[c, 1] * y + corners[c, 2] * z
             if along > most:
                 best, most = c, along
-        at[0], at[1], at[2] = corners[best, 0], corners[best, 1], corners[best, 2]
+        if best == tip:
+            return tip
+        tip = best
+
+
+@kernel
+def _furthest(
+    k: int, tip: int, kinds: Ints, sizes: Array, corners: Array, firsts: Ints, rings: Ints, world: Array,
+    x: float, y: float, z: float,
+) -> tuple[float, float, float, int]:  # fmt: skip
+    """The furthest point of a shape along a direction of the base frame, and its corner; of a sphere, the centre."""
+    kind = kinds[k]
+    if kind == SPHERE:
+        return world[k, 0, 3], world[k, 1, 3], world[k, 2, 3], tip
+    u = world[k, 0, 0] * x + world[k, 1, 0] * y + world[k, 2, 0] * z
+    v = world[k, 0, 1] * x + world[k, 1, 1] * y + world[k, 2, 1] * z
+    w = world[k, 0, 2] * x + world[k, 1, 2] * y + world[k, 2, 2] * z
+    if kind == HULL:
+        tip = _climb(tip, corners, firsts, rings, u, v, w)
+        u, v, w = corners[tip, 0], corners[tip, 1], corners[tip, 2]
     elif kind == BOX:
-        at[0], at[1], at[2] = (
-            math.copysign(sizes[k, 0], x),
-            math.copysign(sizes[k, 1], y),
-            math.copysign(sizes[k, 2], z),
-        )
-    elif kind == CYLINDER:
-        off = math.sqrt(x * x + y * y)
-        share = sizes[k, 0] / off if off > 1e-12 else 0.0
-        at[0], at[1], at[2] = x * share, y * share, math.copysign(sizes[k, 1], z)
+        u, v, w = math.copysign(sizes[k, 0], u), math.copysign(sizes[k, 1], v), math.copysign(sizes[k, 2], w)
     else:
-        at[0] = at[1] = at[2] = 0.0
+        off = math.sqrt(u * u + v * v)
+        share = sizes[k, 0] / off if off > 1e-12 else 0.0
+        u, v, w = u * share, v * share, math.copysign(sizes[k, 1], w)
+    px = world[k, 0, 0] * u + world[k, 0, 1] * v + world[k, 0, 2] * w + world[k, 0, 3]
+    py = world[k, 1, 0] * u + world[k, 1, 1] * v + world[k, 1, 2] * w + world[k, 1, 3]
+    pz = world[k, 2, 0] * u + world[k, 2, 1] * v + world[k, 2, 2] * w + world[k, 2, 3]
+    return px, py, pz, tip
 
 
-@njit(cache=True, nogil=True)
-def _difference(
-    i: int,
-    j: int,
-    kinds: Ints,
-    sizes: Array,
-    corners: Array,
-    firsts: Ints,
-    world: Array,
-    x: float,
-    y: float,
-    z: float,
-    room: Array,
-) -> tuple[float, float, float]:
-    """The point of shape i less shape j that is furthest along a direction of the base frame."""
-    a, b = room[4], room[5]
-    _corner(
-        i,
-        kinds,
-        sizes,
-        corners,
-        firsts,
-        world[i, 0, 0] * x + world[i, 1, 0] * y + world[i, 2, 0] * z,
-        world[i, 0, 1] * x + world[i, 1, 1] * y + world[i, 2, 1] * z,
-        world[i, 0, 2] * x + world[i, 1, 2] * y + world[i, 2, 2] * z,
-        a,
-    )
-    _corner(
-        j,
-        kinds,
-        sizes,
-        corners,
-        firsts,
-        -(world[j, 0, 0] * x + world[j, 1, 0] * y + world[j, 2, 0] * z),
-        -(world[j, 0, 1] * x + world[j, 1, 1] * y + world[j, 2, 1] * z),
-        -(world[j, 0, 2] * x + world[j, 1, 2] * y + world[j, 2, 2] * z),
-        b,
-    )
-    px = world[i, 0, 0] * a[0] + world[i, 0, 1] * a[1] + world[i, 0, 2] * a[2] + world[i, 0, 3]
-    py = world[i, 1, 0] * a[0] + world[i, 1, 1] * a[1] + world[i, 1, 2] * a[2] + world[i, 1, 3]
-    pz = world[i, 2, 0] * a[0] + world[i, 2, 1] * a[1] + world[i, 2, 2] * a[2] + world[i, 2, 3]
-    qx = world[j, 0, 0] * b[0] + world[j, 0, 1] * b[1] + world[j, 0, 2] * b[2] + world[j, 0, 3]
-    qy = world[j, 1, 0] * b[0] + world[j, 1, 1] * b[1] + world[j, 1, 2] * b[2] + world[j, 1, 3]
-    qz = world[j, 2, 0] * b[0] + world[j, 2, 1] * b[1] + world[j, 2, 2] * b[2] + world[j, 2, 3]
-    return px - qx, py - qy, pz - qz
-
-
-@njit(cache=True, nogil=True)
+@kernel
 def hull_separation(
-    i: int,
-    j: int,
-    keep: float,
-    enough: float,
-    kinds: Ints,
-    sizes: Array,
-    corners: Array,
-    firsts: Ints,
-    world: Array,
-    room: Array,
-) -> float:
+    p: int, i: int, j: int, keep: float, enough: float, kinds: Ints, sizes: Array, corners: Array, firsts: Ints,
+    rings: Ints, world: Array, axes: Array, tips: Ints, room: Array,
+) -> float:  # fmt: skip
     """Distance that two shapes are proven to keep, searched until it is `enough` or `keep` can't be reached.
 
+    It starts with the axis that proved the most when the pair was last asked about, which mostly decides.
+
     Args:
+        p: Row of the pair in `axes` and `tips`.
         i: A shape.
         j: Another one.
         keep: Distance below which it does not matter how near they are, m; < 0 allows overlap.
@@ -118,44 +81,57 @@ def hull_separation(
         sizes: See `Model`.
         corners: See `Model`.
         firsts: See `Model`.
+        rings: See `Model`.
         world: (s, 3, 4) poses of shapes.
-        room: (6, 3) for the simplex and two points.
+        axes: (pairs, 3) last axes, from the second shape to the first, in the frame of the second; 0 without one.
+        tips: (pairs, 2) last corners of both shapes.
+        room: (12, 3) for simplices.
     """
     # a sphere is its centre with a margin
-    margin = (sizes[i, 0] if kinds[i] == 2 else 0.0) + (sizes[j, 0] if kinds[j] == 2 else 0.0)
-    x, y, z = world[i, 0, 3] - world[j, 0, 3], world[i, 1, 3] - world[j, 1, 3], world[i, 2, 3] - world[j, 2, 3]
+    margin = (sizes[i, 0] if kinds[i] == SPHERE else 0.0) + (sizes[j, 0] if kinds[j] == SPHERE else 0.0)
+    u, v, w = axes[p, 0], axes[p, 1], axes[p, 2]
+    x = world[j, 0, 0] * u + world[j, 0, 1] * v + world[j, 0, 2] * w
+    y = world[j, 1, 0] * u + world[j, 1, 1] * v + world[j, 1, 2] * w
+    z = world[j, 2, 0] * u + world[j, 2, 1] * v + world[j, 2, 2] * w
     square = x * x + y * y + z * z
-    if square < _ZERO:
-        x, y, z, square = 1.0, 0.0, 0.0, 1.0
-    best, count = -math.inf, 0
+    if square < 0.5:
+        x, y, z = world[i, 0, 3] - world[j, 0, 3], world[i, 1, 3] - world[j, 1, 3], world[i, 2, 3] - world[j, 2, 3]
+        square = x * x + y * y + z * z
+        if square < _ZERO:
+            x, y, z, square = 1.0, 0.0, 0.0, 1.0
+    a, b = tips[p, 0], tips[p, 1]
+    best, count, bx, by, bz = -math.inf, 0, 0.0, 0.0, 0.0
     for _ in range(_STEPS):
-        wx, wy, wz = _difference(i, j, kinds, sizes, corners, firsts, world, -x, -y, -z, room)
-        along = wx * x + wy * y + wz * z
-        norm = math.sqrt(square)
-        best = max(best, along / norm - margin)
-        if best >= enough:
-            return best
-        if count > 0 and (square - along <= _CLOSE * square or norm - margin < keep):
-            return best
+        ax, ay, az, a = _furthest(i, a, kinds, sizes, corners, firsts, rings, world, -x, -y, -z)
+        cx, cy, cz, b = _furthest(j, b, kinds, sizes, corners, firsts, rings, world, x, y, z)
+        wx, wy, wz = ax - cx, ay - cy, az - cz
+        along, norm = wx * x + wy * y + wz * z, math.sqrt(square)
+        if along / norm - margin > best:
+            best, bx, by, bz = along / norm - margin, x / norm, y / norm, z / norm
+        if best >= enough or (count > 0 and (square - along <= _CLOSE * square or norm - margin < keep)):
+            break
         room[count, 0], room[count, 1], room[count, 2] = wx, wy, wz
         count, x, y, z = _nearest(room, count + 1)
         square = x * x + y * y + z * z
         if count == 4 or square < _ZERO:
             break
-    if keep + margin < 0.0:  # they overlap, and may: what the axes of both prove
+    if best < enough and keep + margin < 0.0:  # they overlap, and may: what the axes of both prove
         for shape in range(2):
             k = i if shape == 0 else j
             for axis in range(6):
                 sign = 1.0 if axis < 3 else -1.0
                 x, y, z = sign * world[k, 0, axis % 3], sign * world[k, 1, axis % 3], sign * world[k, 2, axis % 3]
-                wx, wy, wz = _difference(i, j, kinds, sizes, corners, firsts, world, -x, -y, -z, room)
-                best = max(best, wx * x + wy * y + wz * z - margin)
-                if best >= enough:
-                    return best
+                ax, ay, az, a = _furthest(i, a, kinds, sizes, corners, firsts, rings, world, -x, -y, -z)
+                cx, cy, cz, b = _furthest(j, b, kinds, sizes, corners, firsts, rings, world, x, y, z)
+                best = max(best, (ax - cx) * x + (ay - cy) * y + (az - cz) * z - margin)
+    tips[p, 0], tips[p, 1] = a, b
+    axes[p, 0] = world[j, 0, 0] * bx + world[j, 1, 0] * by + world[j, 2, 0] * bz
+    axes[p, 1] = world[j, 0, 1] * bx + world[j, 1, 1] * by + world[j, 2, 1] * bz
+    axes[p, 2] = world[j, 0, 2] * bx + world[j, 1, 2] * by + world[j, 2, 2] * bz
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest(s: Array, count: int) -> tuple[int, float, float, float]:
     """Reduce a simplex (its first `count` rows) to the face that is nearest to the origin; its size and that point."""
     if count == 1:
@@ -167,8 +143,10 @@ def _nearest(s: Array, count: int) -> tuple[int, float, float, float]:
     # of the faces that have the origin outside, the one that is nearest
     found, fx, fy, fz = 4, 0.0, 0.0, 0.0
     least = math.inf
-    p = s[:4].copy()
-    kept = p.copy()
+    p, kept = s[4:8], s[8:12]
+    for m in range(4):
+        for r in range(3):
+            p[m, r] = s[m, r]
     for k in range(4):
         a, b, c = p[(k + 1) % 4], p[(k + 2) % 4], p[(k + 3) % 4]
         ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -193,7 +171,7 @@ def _nearest(s: Array, count: int) -> tuple[int, float, float, float]:
     return found, fx, fy, fz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _on_segment(s: Array) -> tuple[int, float, float, float]:
     """As `_nearest`, of two points."""
     ux, uy, uz = s[1, 0] - s[0, 0], s[1, 1] - s[0, 1], s[1, 2] - s[0, 2]
@@ -207,13 +185,13 @@ def _on_segment(s: Array) -> tuple[int, float, float, float]:
     return 2, s[0, 0] + t * ux, s[0, 1] + t * uy, s[0, 2] + t * uz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _keep(s: Array, to: int, k: int) -> None:
     for r in range(3):
         s[to, r] = s[k, r]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _on_triangle(s: Array) -> tuple[int, float, float, float]:
     """As `_nearest`, of three points, by the regions about the triangle (Ericson, "Real-time collision detection")."""
     ax, ay, az = s[0, 0], s[0, 1], s[0, 2]

@@ -1,87 +1,80 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convex hulls, and the capsule about each that the fast collision layer asks first. m."""
+"""Convex hulls as the kernels take them: corners, and the edges that join them. m."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
-from openarm_common.types import Array
-
-#: Directions that a capsule is tried in, and that its overhang is measured in.
-_TRIED, _MEASURED = 24, 1000
-#: Added to the radius of a capsule, so that rounding leaves no corner outside, m.
-_ROUNDING = 1e-9
+from openarm_common.types import Array, Ints
 
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """A convex hull with a capsule about it.
+    """A convex hull about the middle of the box that holds it.
 
     Attributes:
-        T: (4, 4) pose of the capsule in the frame of the hull; its axis is z.
-        corners: (n, 3) of the hull, in the frame of the capsule.
-        radius: Of the capsule, m.
-        half: Half the length of its axis, m.
-        overhang: How far the capsule reaches beyond the hull, m: measured in 1000 directions.
+        centre: (3,) middle of that box, in the frame of the points.
+        corners: (n, 3) from there.
+        triangles: (m, 3) faces, turned outwards.
+        rings: Of each corner, those that edges lead to.
+        planes: (m, 4) that touch it along its faces: outward normal, and minus its distance from the centre.
     """
 
-    T: Array
+    centre: Array
     corners: Array
-    radius: float
-    half: float
-    overhang: float
+    triangles: Ints
+    rings: Sequence[Ints]
+    planes: Array
 
     @classmethod
     def of(cls, points: Array) -> Hull:
-        """Put the smallest capsule found about points (n, 3).
+        """Take the hull of points (n, 3).
 
-        Capsules are tried about the principal axes, the axes of the frame and directions spread over a sphere. About
-        each, the radius is that of a circle about the points as seen along it (Badoiu and Clarkson, "Smaller core-sets
-        for balls", 2003), or a little larger where that makes the capsule shorter.
+        Raises:
+            QhullError: when they span no volume.
         """
-        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-        tried = [_capsule(points - middle, u) for u in (*principal, *np.eye(3), *directions(_TRIED))]
-        _, R, centre, radius, half = min(tried, key=lambda capsule: capsule[0])
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, middle + centre
-        corners = (points - T[:3, 3]) @ R
-        seen = directions(_MEASURED)
-        # of convex bodies one in the other, the distance is that of their tangent planes where it is greatest
-        gaps = radius + half * np.abs(seen[:, 2]) - (seen @ corners.T).max(axis=1)
-        return cls(T, corners, radius, half, float(gaps.max()))
+        found = ConvexHull(points)
+        centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        corners, row = points[found.vertices] - centre, np.full(len(points), -1)
+        row[found.vertices] = np.arange(len(corners))
+        triangles, normals = row[found.simplices].astype(np.int64), found.equations[:, :3]
+        a, b, c = (corners[triangles[:, k]] for k in range(3))
+        inwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals) < 0.0
+        triangles[inwards] = triangles[inwards][:, ::-1]
+        edges = np.unique(np.concatenate([triangles[:, [i, j]] for i in range(3) for j in range(3) if i != j]), axis=0)
+        rings = np.split(edges[:, 1], np.searchsorted(edges[:, 0], np.arange(1, len(corners))))
+        planes = np.column_stack([normals, -(normals @ corners.T).max(axis=1)])
+        return cls(centre, corners, triangles, rings, planes)
+
+    @property
+    def half(self) -> Array:
+        """(3,) half edges of the box."""
+        return self.corners.max(axis=0)
+
+    def beyond(self, points: Array, distance: float) -> NDArray[np.bool_]:
+        """Whether points (n, 3) from the centre are further than a distance from the hull, by one of its faces."""
+        return (points @ self.planes[:, :3].T + self.planes[:, 3]).max(axis=1) > distance
 
 
-@lru_cache(maxsize=4)
-def directions(count: int) -> Array:
-    """Unit vectors (n, 3) spread evenly over a sphere."""
-    k = np.arange(count) + 0.5
-    polar, turn = np.arccos(1.0 - 2.0 * k / count), np.pi * (1.0 + 5.0**0.5) * k
-    return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+def joined_corners(hulls: Sequence[Hull | None]) -> tuple[Array, Ints, Ints, Ints]:
+    """Put hulls one after the other; None is a shape without corners.
 
-
-def _capsule(points: Array, u: Array) -> tuple[float, Array, Array, float, float]:
-    """Volume, rotation (3, 3) with z along `u`, centre (3,), radius and half length of a capsule about points."""
-    u = u / np.linalg.norm(u)
-    x = np.cross(u, np.eye(3)[int(np.argmin(np.abs(u)))])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(u, x), u], axis=1)
-    local = points @ R
-    flat, along = local[:, :2], local[:, 2]
-    centre = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
-    for k in range(40):
-        away = flat - centre
-        centre = centre + away[int(np.argmax(np.einsum("ij,ij->i", away, away)))] / (k + 2.0)
-    off = np.linalg.norm(flat - centre, axis=1)
-    found = []
-    for factor in (1.0, 1.03, 1.08, 1.15, 1.3):
-        r = float(off.max()) * factor + 1e-6
-        room = np.sqrt(np.maximum(r * r - off * off, 0.0))
-        low, high = float((along + room).min()), float((along - room).max())
-        low, high = (low, high) if low < high else (0.5 * (low + high),) * 2
-        half, middle = 0.5 * (high - low), R @ np.array([*centre, 0.5 * (low + high)])
-        found.append((np.pi * r * r * (2.0 * half + 4.0 / 3.0 * r), R, middle, r + _ROUNDING, half))
-    return min(found, key=lambda capsule: capsule[0])
+    Returns:
+        Corners (v, 3) of all, some corner of each shape (s,), where the neighbours of each corner begin (v + 1,), and
+        the neighbours.
+    """
+    counts = [0 if hull is None else len(hull.corners) for hull in hulls]
+    starts = np.cumsum([0, *counts])
+    found = [(hull, int(start)) for hull, start in zip(hulls, starts, strict=False) if hull is not None]
+    sizes = [len(ring) for hull, _ in found for ring in hull.rings]
+    return (
+        np.concatenate([np.empty((0, 3)), *(hull.corners for hull, _ in found)]),
+        np.where(np.array(counts, np.int64) > 0, starts[:-1], 0).astype(np.int64),
+        np.cumsum([0, *sizes]).astype(np.int64),
+        np.concatenate([np.empty(0, np.int64), *(ring + start for hull, start in found for ring in hull.rings)]),
+    )

@@ -11,9 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common import se3
 from openarm_common.collision.body_kernels import place_bodies, put_shape
 from openarm_common.collision.hull_kernels import hull_separation
-from openarm_common.collision.hulls import Hull
+from openarm_common.collision.hulls import Hull, joined_corners
 from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE, separation
 from openarm_common.robot.bodies import Bodies
 from openarm_common.robot.description import RobotDescription
@@ -24,7 +25,6 @@ from openarm_common.types import Array, Ints
 _FAR = 0.02
 #: Random states in which links that always touch must do so, as in the planner.
 _SAMPLES = 1000
-_NO_CORNERS = np.empty((0, 3))
 
 
 @dataclass(frozen=True)
@@ -53,21 +53,21 @@ class SelfCollision:
         found = [(name, shape) for name, link in description.links.items() for shape in link.collision]
         self._links = [name for name, _ in found]
         packed = [_packed(shape) for _, shape in found]
-        kinds, sizes, corners, poses = zip(*packed, strict=True) if packed else ((), (), (), ())
+        kinds, sizes, hulls, poses = zip(*packed, strict=True) if packed else ((), (), (), ())
         self._tree = (
             np.array([body[at.body[joint.parent]] for joint in joints], np.int64),
             np.array([fixed[joint.parent] @ joint.T_parent_joint for joint in joints]).reshape(-1, 4, 4),
             np.array([joint.axis / np.linalg.norm(joint.axis) for joint in joints]).reshape(-1, 3),
             np.array([joint.type == "prismatic" for joint in joints], np.bool_),
         )
-        radii = [shape_radius(*shape[:3]) for shape in packed]
+        none = np.empty((0, 3))
+        radii = [shape_radius(kind, size, hull.corners if hull else none) for kind, size, hull, _ in packed]
         bodies = np.array([body[at.body[name]] for name in self._links], np.int64)
         placed = [fixed[name] @ T for name, T in zip(self._links, poses, strict=True)]
         self._shapes = (
             np.array(kinds, np.int64),
             np.array(sizes).reshape(-1, 3),
-            np.concatenate([_NO_CORNERS, *corners]),
-            np.cumsum([0, *(len(c) for c in corners)]).astype(np.int64),
+            *joined_corners(hulls),
             np.array(radii),
             bodies,
             np.array(placed).reshape(-1, 4, 4)[:, :3].copy(),
@@ -76,7 +76,7 @@ class SelfCollision:
         self._frames[0, :3, :3] = np.eye(3)
         self._world = self._shapes[-1].copy()
         self._done = np.zeros(len(found) + 1, np.int64)
-        self._room = np.empty((6, 3))
+        self._room = np.empty((12, 3))
         n = len(found)
         pairs = [(i, j) for i in range(n) for j in range(i) if at.checked(self._links[i], self._links[j])]
         self._pairs: Ints = np.array(pairs, np.int64).reshape(-1, 2)
@@ -113,7 +113,13 @@ class SelfCollision:
 
 
 def shape_radius(kind: int, size: Array, corners: Array) -> float:
-    """Return the radius of the ball about a shape, m; arguments as `_packed` returns them."""
+    """Return the radius of the ball about a shape, m.
+
+    Args:
+        kind: See `shape_kernels`.
+        size: (3,) see there.
+        corners: (n, 3) of a hull.
+    """
     if kind == CYLINDER:
         return float(np.hypot(size[0], size[1]))
     if kind == HULL:
@@ -121,17 +127,17 @@ def shape_radius(kind: int, size: Array, corners: Array) -> float:
     return float(np.linalg.norm(size)) if kind == BOX else float(size[0])
 
 
-def _packed(shape: Primitive) -> tuple[int, Array, Array, Array]:
-    """Return kind, sizes (3,), corners (n, 3) and pose in its link (4, 4) of a shape as the kernels take it."""
+def _packed(shape: Primitive) -> tuple[int, Array, Hull | None, Array]:
+    """Return kind, sizes (3,), hull and pose in its link (4, 4) of a shape as the kernels take it."""
     T = shape.T_link_primitive
     if shape.corners is not None:
         hull = Hull.of(shape.corners)
-        return HULL, np.array([hull.radius, hull.half, 0.0]), hull.corners, T @ hull.T
+        return HULL, hull.half, hull, T @ se3.make(None, hull.centre)
     if shape.kind == "box":
-        return BOX, 0.5 * np.array(shape.size), _NO_CORNERS, T
+        return BOX, 0.5 * np.array(shape.size), None, T
     if shape.kind == "cylinder":
-        return CYLINDER, np.array([shape.size[0], 0.5 * shape.size[1], 0.0]), _NO_CORNERS, T
-    return SPHERE, np.array([shape.size[0], 0.0, 0.0]), _NO_CORNERS, T
+        return CYLINDER, np.array([shape.size[0], 0.5 * shape.size[1], 0.0]), None, T
+    return SPHERE, np.array([shape.size[0], 0.0, 0.0]), None, T
 
 
 def _in_order(description: RobotDescription) -> list[Joint]:
@@ -166,7 +172,7 @@ def _from_body(description: RobotDescription, link: str) -> Array:
 def _measure(
     q: Array,
     tree: tuple[Ints, Array, Array, NDArray[np.bool_]],
-    shapes: tuple[Ints, Array, Array, Ints, Array, Ints, Array],
+    shapes: tuple[Ints, Array, Array, Ints, Ints, Ints, Array, Ints, Array],
     pairs: Ints,
     frames: Array,
     world: Array,
@@ -175,7 +181,8 @@ def _measure(
     out: Array,
 ) -> None:
     parents, placements, axes, prismatic = tree
-    kinds, sizes, corners, firsts, radii, bodies, poses = shapes
+    kinds, sizes, corners, tips, firsts, rings, radii, bodies, poses = shapes
+    past, at = np.zeros((1, 3)), np.zeros((1, 2), np.int64)
     place_bodies(q, parents, placements, axes, prismatic, frames)
     done[-1] += 1
     for p in range(pairs.shape[0]):
@@ -187,8 +194,13 @@ def _measure(
         if x * x + y * y + z * z >= reach * reach:
             out[p] = _FAR
             continue
-        proven = separation(i, j, _FAR, kinds, sizes, world)
+        hull = kinds[i] == HULL or kinds[j] == HULL
+        proven = -math.inf if hull else separation(i, j, _FAR, kinds, sizes, world)
         if proven < _FAR:
-            more = hull_separation(i, j, -math.inf, _FAR, kinds, sizes, corners, firsts, world, room)
+            past[0, 0] = past[0, 1] = past[0, 2] = 0.0  # a posture has nothing to do with the one before
+            at[0, 0], at[0, 1] = tips[i], tips[j]
+            more = hull_separation(
+                0, i, j, -math.inf, _FAR, kinds, sizes, corners, firsts, rings, world, past, at, room
+            )
             proven = max(proven, more)
         out[p] = min(proven, _FAR)

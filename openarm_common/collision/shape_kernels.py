@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numba kernel of two shapes: how far apart some axis proves them to be. m.
 
-A shape is a box (half edges), a cylinder (radius, half length, axis z), a sphere (radius) or a convex hull at a pose;
-the hull counts as the capsule about it (radius, half length, axis z) here. Only axes that are worth it are tried, so
-what is returned is proven while the true distance may be larger.
+A shape is a box (half edges), a cylinder (radius, half length, axis z) or a sphere (radius) at a pose. Only axes that
+are worth it are tried, so what is returned is proven while the true distance may be larger. Hulls have a kernel of
+their own.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import math
 
 from numba import njit
 
+from openarm_common.collision.kernel import kernel
 from openarm_common.types import Array, Ints
 
 BOX, CYLINDER, SPHERE, HULL = 0, 1, 2, 3
@@ -24,7 +25,7 @@ def _extent(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: f
         return s0 * abs(x) + s1 * abs(y) + s2 * abs(z)
     if kind == CYLINDER:
         return s1 * abs(z) + s0 * math.sqrt(max(0.0, 1.0 - z * z))
-    return s0 + s1 * abs(z) if kind == HULL else s0
+    return s0
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -42,12 +43,10 @@ def _outside(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: 
             return max(dr, dz)
         dr, dz = max(dr, 0.0), max(dz, 0.0)
         return math.sqrt(dr * dr + dz * dz)
-    if kind == HULL:
-        z = max(abs(z) - s1, 0.0)
     return math.sqrt(x * x + y * y + z * z) - s0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def separation(i: int, j: int, enough: float, kinds: Ints, sizes: Array, world: Array) -> float:
     """Distance that two shapes are proven to keep (< 0: they overlap no deeper); searched until it is `enough`.
 

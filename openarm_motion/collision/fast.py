@@ -8,7 +8,7 @@ shapes. A scene is a snapshot: boxes that are moved later, and other joints, are
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from openarm_common import se3
+from openarm_common.collision.hulls import Hull, joined_corners
 from openarm_common.collision.self_collision import shape_radius
 from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE
 from openarm_common.errors import Code, OpenArmError
@@ -104,19 +105,15 @@ class _Swings:
             body = self._parents[i]
         return out
 
-    def between(self, clusters: Sequence[_Cluster], groups: NDArray[np.int64]) -> Array:
-        """(g, n) for pairs of clusters, one as seen by the other: joints that move both as one body do nothing."""
-        each = np.array([self.of(cluster) for cluster in clusters])
-        one, two = each[groups[:, 0]], each[groups[:, 1]]
-        return np.where((one > 0.0) & (two > 0.0), 0.0, one + two)
-
 
 class _Packer:
     def __init__(self, scenes: Sequence[CollisionScene], field: DistanceMap | None) -> None:
         self._scenes, self._field = scenes, field
         self._kinds: list[int] = []
         self._sizes: list[Array] = []
-        self._corners: list[Array] = []
+        self._hulls: list[Hull | None] = []
+        #: Meshes that nothing but a joint of the arms moves, with their poses on its body.
+        self._rigid: dict[int, tuple[Mesh, Array]] = {}
         self._radii: list[float] = []
         self._bodies: list[int] = []
         self._poses: list[Array] = []
@@ -151,21 +148,24 @@ class _Packer:
         parents: Sequence[int],
         joints: dict[int, int],
     ) -> None:
-        kind, size, corners = _kind(shape)
-        if isinstance(shape, Mesh):
-            T = T @ shape.hull.T
+        kind, size = _kind(shape)
         mover = joint
         while mover > 0 and mover not in joints:
             mover = parents[mover]
         body = joints.get(mover, 0)
         pose = places[joint] @ T if body == 0 else se3.inverse(places[mover]) @ places[joint] @ T
-        self._put(kind, size, body, pose, corners)
+        if not isinstance(shape, Mesh):
+            self._put(kind, size, body, pose)
+            return
+        if body > 0 and mover == joint:
+            self._rigid[len(self._kinds)] = shape, pose
+        self._put(kind, size, body, pose @ se3.make(None, shape.hull.centre), shape.hull)
 
-    def _put(self, kind: int, size: Array, body: int, pose: Array, corners: Array = _NO_CORNERS) -> None:
+    def _put(self, kind: int, size: Array, body: int, pose: Array, hull: Hull | None = None) -> None:
         self._kinds.append(kind)
         self._sizes.append(size)
-        self._corners.append(corners)
-        self._radii.append(shape_radius(kind, size, corners))
+        self._hulls.append(hull)
+        self._radii.append(shape_radius(kind, size, _NO_CORNERS if hull is None else hull.corners))
         self._bodies.append(body)
         self._poses.append(pose[:3])
 
@@ -180,13 +180,15 @@ class _Packer:
         ends = np.concatenate([np.maximum(np.abs(chain.lower), np.abs(chain.upper)) for chain in chains])
         swings = _Swings(parents, np.linalg.norm(placements[:, :3, 3], axis=1), prismatic, ends)
         clusters, of = self._clusters()
-        groups, reaches, pairs, keep = self._groups(of, clusters)
+        hulls = self._cluster_hulls(clusters, of)
+        groups, reaches, pairs, keep = self._groups(of, clusters, parents)
         moving = sum(cluster.body > 0 for cluster in clusters)
         still = [int(row[0]) for row in groups if row[1] >= moving]
         spheres, sphere_groups, bounds, covered = self._spheres()
         if self._field is not None:  # a cell of the map, which is put where it is when it is checked
             self._put(BOX, np.full(3, 0.5 * self._field.resolution), 0, np.eye(4))
         field = self._field or _NO_MAP
+        corners, tips, firsts, rings = joined_corners(self._hulls)
         slack = float(np.sqrt(3.0)) * field.resolution
         need = float(spheres[:, 3].max(initial=0.0)) + slack
         if need > field.reach:
@@ -195,10 +197,8 @@ class _Packer:
                 f"distances of the map are cut at {field.reach:.3f} m, expected {need:.3f} m or more",
             )
         balls = [
-            swings.of(_Cluster(int(body), ball[:3], ball[3]))
-            for (body, _, _), ball in zip(sphere_groups, bounds, strict=True)
+            _Cluster(int(body), ball[:3], ball[3]) for (body, _, _), ball in zip(sphere_groups, bounds, strict=True)
         ]
-        sways = np.concatenate([swings.between(clusters, groups), np.array(balls).reshape(-1, len(parents))])
         return Model(
             parents=np.array(parents, np.int64),
             placements=placements,
@@ -206,20 +206,23 @@ class _Packer:
             prismatic=prismatic,
             kinds=np.array(self._kinds, np.int64),
             sizes=np.array(self._sizes),
-            corners=np.concatenate(self._corners),
-            firsts=np.cumsum([0, *(len(corners) for corners in self._corners)]).astype(np.int64),
+            corners=corners,
+            tips=tips,
+            firsts=firsts,
+            rings=rings,
             radii=np.array(self._radii),
             bodies=np.array(self._bodies, np.int64),
             poses=np.array(self._poses),
             clusters=np.array([cluster.body for cluster in clusters], np.int64),
             centres=np.array([cluster.centre for cluster in clusters]),
             bounds=np.array([cluster.radius for cluster in clusters]),
+            hulls=hulls,
             runs=np.searchsorted(still, np.arange(moving + 1)).astype(np.int64),
             groups=groups,
             points=np.array([clusters[b].centre for b in groups[:, 1]], np.float64).reshape(-1, 3).T.copy(),
             reaches=reaches,
             spans=reaches + np.array([clusters[a].radius + clusters[b].radius for a, b in groups[:, :2]]),
-            swings=sways,
+            swings=np.array([swings.of(c) for c in (*clusters[:moving], *balls)]).reshape(-1, len(parents)),
             pairs=pairs,
             keep=keep,
             spheres=spheres,
@@ -232,11 +235,23 @@ class _Packer:
             edge=np.array([field.resolution, slack]),
         )
 
+    def _cover(self, k: int) -> Array:
+        """Spheres (m, 4) that together hold a shape, in its frame."""
+        hull, size = self._hulls[k], tuple(self._sizes[k].tolist())
+        if hull is None:
+            return cover(self._kinds[k], size)
+        balls = cover(BOX, size)
+        return balls[~hull.beyond(balls[:, :3], float(balls[0, 3]))]
+
     def _clusters(self) -> tuple[list[_Cluster], dict[int, int]]:
-        """Shapes of one body are a cluster, each shape that does not move is its own; which cluster a shape is in."""
+        """Put rigid meshes of a body into a cluster, its other shapes into another, each shape at rest into its own.
+
+        Returns:
+            The clusters, those that move first, and the cluster of each shape.
+        """
         members: dict[tuple[int, int], list[int]] = {}
         for k, body in enumerate(self._bodies):
-            members.setdefault((body, -1 if body else k), []).append(k)
+            members.setdefault((body, -int(k in self._rigid) if body else k), []).append(k)
         out: list[_Cluster] = []
         of: dict[int, int] = {}
         for (body, _), shapes in sorted(members.items(), key=lambda item: item[0][0] == 0):
@@ -251,12 +266,28 @@ class _Packer:
             out.append(_Cluster(body, centre, float(np.max(np.linalg.norm(places - centre, axis=1) + radii))))
         return out, of
 
+    def _cluster_hulls(self, clusters: Sequence[_Cluster], of: Mapping[int, int]) -> NDArray[np.int64]:
+        """(c,) the shape that holds all of each cluster: its only one, the hull of several meshes; -1 without one."""
+        members: list[list[int]] = [[] for _ in clusters]
+        for k, cluster in of.items():
+            members[cluster].append(k)
+        out = np.full(len(clusters), -1, np.int64)
+        for c, shapes in enumerate(members):
+            if len(shapes) == 1:
+                out[c] = shapes[0]
+            elif all(k in self._rigid for k in shapes):
+                meshes, poses = zip(*(self._rigid[k] for k in shapes), strict=True)
+                hull = _joined(meshes, np.array(poses).tobytes())
+                out[c] = len(self._kinds)
+                self._put(HULL, hull.half, clusters[c].body, se3.make(None, hull.centre), hull)
+        return out
+
     def _groups(
-        self, of: dict[int, int], clusters: list[_Cluster]
+        self, of: dict[int, int], clusters: list[_Cluster], parents: Sequence[int]
     ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
         if not self._keep:
-            return np.empty((0, 5), np.int64), np.empty(0), np.empty((0, 2), np.int64), np.empty(0)
-        cluster_of = np.array([of[k] for k in range(len(self._kinds))])
+            return np.empty((0, 6), np.int64), np.empty(0), np.empty((0, 2), np.int64), np.empty(0)
+        cluster_of = np.array([of[k] for k in range(len(of))])
         lone = np.full(len(clusters), -1)
         for k, cluster in of.items():
             if clusters[cluster].body == 0:
@@ -266,7 +297,9 @@ class _Packer:
         order = np.lexsort((b, a, lone[b] < 0))
         a, b, keep = a[order], b[order], keep[order]
         first = np.flatnonzero(np.diff(a, prepend=-1) | np.diff(b, prepend=-1))
-        groups = np.stack([a[first], b[first], first, np.append(first[1:], len(a)), lone[b[first]]], axis=1)
+        a, b = a[first], b[first]
+        common = [_carrier(clusters[x].body, clusters[y].body, parents) for x, y in zip(a, b, strict=True)]
+        groups = np.stack([a, b, first, np.append(first[1:], len(order)), lone[b], common], axis=1)
         pairs = np.stack([i[order], j[order]], axis=1)
         return groups, np.maximum(np.maximum.reduceat(keep, first), 0.0), pairs, keep
 
@@ -282,7 +315,7 @@ class _Packer:
             mine: list[Array] = []
             for k, keep in self._covered.items():
                 if self._bodies[k] == body:
-                    balls = cover(self._kinds[k], tuple(self._sizes[k].tolist()))
+                    balls = self._cover(k)
                     p = balls[:, :3] @ self._poses[k][:, :3].T + self._poses[k][:, 3]
                     mine.append(np.column_stack([p, balls[:, 3] + keep]))
                     shapes.append(np.tile((float(k), keep + _ROUNDING), (len(balls), 1)))
@@ -301,12 +334,27 @@ class _Packer:
         )
 
 
+@lru_cache(maxsize=64)
+def _joined(meshes: tuple[Mesh, ...], poses: bytes) -> Hull:
+    """The hull of meshes at poses (n, 4, 4) of one frame."""
+    places = np.frombuffer(poses).reshape(-1, 4, 4)
+    points = [mesh.vertices @ T[:3, :3].T + T[:3, 3] for mesh, T in zip(meshes, places, strict=True)]
+    return Hull.of(np.concatenate(points))
+
+
+def _carrier(a: int, b: int, parents: Sequence[int]) -> int:
+    """The last body that carries both of two bodies, or is one of them."""
+    while a != b:
+        a, b = (parents[a - 1], b) if a > b else (a, parents[b - 1])
+    return a
+
+
 @lru_cache(maxsize=512)
 def cover(kind: int, size: tuple[float, float, float]) -> Array:
     """Spheres (m, 4), centre and radius, that together hold a shape, in its frame."""
     if kind == SPHERE:
         return np.array([[0.0, 0.0, 0.0, size[0]]])
-    half = np.array(size if kind == BOX else (size[0], size[0], size[1] + (size[0] if kind == HULL else 0.0)))
+    half = np.array(size if kind == BOX else (size[0], size[0], size[1]))
     counts = np.maximum(np.ceil(2.0 * half / _CELL), 1).astype(int)
     cell = 2.0 * half / counts
     centres = -half + (np.indices(counts.tolist()).reshape(3, -1).T + 0.5) * cell
@@ -316,14 +364,14 @@ def cover(kind: int, size: tuple[float, float, float]) -> Array:
     return np.column_stack([centres, np.full(len(centres), 0.5 * float(np.linalg.norm(cell)) + 1e-9)])
 
 
-def _kind(shape: Solid) -> tuple[int, Array, Array]:
-    """Kind, sizes (3,) and corners (n, 3) of a body as the kernels take them."""
+def _kind(shape: Solid) -> tuple[int, Array]:
+    """Kind and sizes (3,) of a body as the kernels take them."""
     if isinstance(shape, Box):
-        return BOX, 0.5 * shape.size, _NO_CORNERS
+        return BOX, 0.5 * shape.size
     if isinstance(shape, Cylinder):
-        return CYLINDER, np.array([shape.radius, 0.5 * shape.length, 0.0]), _NO_CORNERS
+        return CYLINDER, np.array([shape.radius, 0.5 * shape.length, 0.0])
     if isinstance(shape, Sphere):
-        return SPHERE, np.array([shape.radius, 0.0, 0.0]), _NO_CORNERS
+        return SPHERE, np.array([shape.radius, 0.0, 0.0])
     if isinstance(shape, Mesh):
-        return HULL, np.array([shape.hull.radius, shape.hull.half, 0.0]), shape.hull.corners
+        return HULL, shape.hull.half
     raise OpenArmError(Code.INVALID_ARGUMENT, f"shape {type(shape).__name__}; valid: box, cylinder, sphere, mesh")

@@ -10,19 +10,18 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from openarm_common.collision.kernel import kernel
 from openarm_common.types import Array
-from openarm_motion.collision.clearance_kernels import Model, Work, check_listed, near, place, sift
+from openarm_motion.collision.clearance_kernels import Model, Work, check_listed, near, place, sift, sway
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def line_free(a: Array, b: Array, step: float, travel: float, levers: Array, model: Model, work: Work) -> bool:
     """Whether the joint line from `a` to `b` is free at steps as the exact layer takes them, the ends included."""
     return not (near(b, model, work) or near(a, model, work)) and between_free(a, b, step, travel, levers, model, work)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def between_free(a: Array, b: Array, step: float, travel: float, levers: Array, model: Model, work: Work) -> bool:
     """As `line_free`, but for the ends."""
     largest, way = 0.0, 0.0
@@ -33,12 +32,7 @@ def between_free(a: Array, b: Array, step: float, travel: float, levers: Array, 
     n = math.ceil(max(largest / step, way / travel, 1.0))
     if n == 1:
         return True
-    swings, sways, lists, spans = model.swings, work.sways, work.lists, work.spans
-    for g in range(swings.shape[0]):
-        sway = 0.0
-        for i in range(a.shape[0]):
-            sway += abs(b[i] - a[i]) * swings[g, i]
-        sways[g] = sway
+    sways, lists, spans = work.sways, work.lists, work.spans
     # the first interval is the whole line; whatever is not listed for an interval can't get too near in it
     head, tail, end = 0, 1, 0
     spans[0, 0], spans[0, 1], spans[0, 2], spans[0, 3] = 0, n, 0, 0
@@ -49,14 +43,14 @@ def between_free(a: Array, b: Array, step: float, travel: float, levers: Array, 
         for i in range(a.shape[0]):
             work.q[i] = a[i] + u * (b[i] - a[i])
         place(work.q, model, work)
-        share = (max(last - middle, middle - first) - 1) / n
+        sway(a, b, (max(last - middle, middle - first) - 1) / n, model, work)
         if head == 0:
-            count = sift(share, model, work)
+            count = sift(sways, model, work)
             end = count
         head += 1
         split = last - first > 2
         listed = split and end + count <= lists.shape[0]
-        kept = check_listed(start, count, end if listed else -1, share, model, work)
+        kept = check_listed(start, count, end if listed else -1, sways, model, work)
         if kept < 0:
             return False
         if listed:

@@ -10,7 +10,7 @@ from functools import cached_property
 import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import QhullError
 
 from openarm_common.collision.hulls import Hull
 from openarm_common.errors import Code, OpenArmError
@@ -146,37 +146,24 @@ class Mesh(Solid):
         if len(self.vertices) < 4:
             raise self._refuse(f"{len(self.vertices)} vertices", "at least 4")
         try:
-            self._hull  # noqa: B018
+            self.hull  # noqa: B018
         except QhullError as error:
             raise self._refuse("vertices in one plane", "some that span a volume") from error
 
     @cached_property
     def hull(self) -> Hull:
-        """Corners and fast shapes about it."""
-        return Hull.of(self._hull[0])
+        """Corners, edges and faces."""
+        return Hull.of(self.vertices)
 
     @property
     def hull_mesh(self) -> tuple[Array, NDArray[np.int64]]:
         """Vertices (k, 3) of the hull, and its triangles (t, 3) turned outwards."""
-        return self._hull
-
-    @cached_property
-    def _hull(self) -> tuple[Array, NDArray[np.int64]]:
-        """Vertices of the hull, and its triangles turned outwards."""
-        hull = ConvexHull(self.vertices)
-        kept = {int(k): i for i, k in enumerate(hull.vertices)}
-        points = self.vertices[hull.vertices]
-        middle = points.mean(axis=0)
-        triangles = np.array([[kept[int(k)] for k in simplex] for simplex in hull.simplices], np.int64)
-        a, b, c = (points[triangles[:, i]] for i in range(3))
-        inwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - middle) < 0.0
-        triangles[inwards] = triangles[inwards][:, ::-1]
-        return points, triangles
+        return self.hull.corners + self.hull.centre, self.hull.triangles
 
     @property
     def geometry(self) -> coal.ShapeBase:
         """See `Solid`."""
-        points, triangles = self._hull
+        points, triangles = self.hull_mesh
         corners = coal.StdVec_Vec3s()
         corners.extend([np.asarray(point) for point in points])
         faces = coal.StdVec_Triangle()

@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
+from openarm_common.collision.kernel import kernel
 from openarm_common.types import Array, Ints
 from openarm_motion.collision.clearance_kernels import Model, Work, near
 from openarm_motion.collision.line_kernels import between_free, line_free
@@ -22,7 +23,7 @@ _UNIFORM, _FAR = 0.05, 6.0
 _TURNS = 20
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest(tree: Array, count: int, q: Array) -> tuple[int, float]:
     best, at = np.inf, 0
     for k in range(count):
@@ -35,7 +36,7 @@ def _nearest(tree: Array, count: int, q: Array) -> tuple[int, float]:
     return at, math.sqrt(best)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw(tree: Array, count: int, bounds: Array, sample: Array) -> None:
     """Draw a sample: mostly far away from a configuration of the tree in a random direction, cut off at the bounds.
 
@@ -136,7 +137,7 @@ def grow(
     return -1, -1, edges
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rest_to_rest(velocity: float, acceleration: float, jerk: float) -> float:
     """Shortest time over a length of one, from rest to rest, within the limits (per that length)."""
     # each half: the acceleration rises, stays, falls; the velocity stays in between
@@ -149,7 +150,7 @@ def rest_to_rest(velocity: float, acceleration: float, jerk: float) -> float:
     return 4.0 * (0.5 / jerk) ** (1.0 / 3.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def duration(a: Array, b: Array, limits: Array) -> float:
     """Time of a straight joint segment from rest to rest, s; `limits` (3, n) are velocity, acceleration, jerk."""
     velocity, acceleration, jerk = np.inf, np.inf, np.inf

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots by their meshes: convex parts, capsules about them, the distance of hulls, and links that always touch."""
+"""Robots by their meshes: convex parts, the distance of hulls, and links that always touch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.collision.hull_kernels import hull_separation
-from openarm_common.collision.hulls import Hull, directions
 from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE
 from openarm_common.robot.convex import convex_parts, hull_of
 from openarm_common.robot.description import RobotDescription
@@ -165,19 +164,22 @@ def test_no_point_of_a_mesh_is_outside_its_parts(seed: int) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(4, 60), st.integers(0, 2**32 - 1), st.floats(0.02, 1.0))
-def test_a_capsule_holds_its_hull_and_its_overhang_is_as_stated(count: int, seed: int, flatness: float) -> None:
+def test_what_is_beyond_a_hull_is_outside(count: int, seed: int, flatness: float) -> None:
+    """No mixture of its points is; all is that is far away; every corner is reached along edges."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3)) * (0.1, 0.1 * flatness, 0.3) @ se3.exp_so3(rng.normal(size=3)).T + 0.2
-    hull = Hull.of(points)
-    local = (points - hull.T[:3, 3]) @ hull.T[:3, :3]
-    np.testing.assert_allclose(local, hull.corners, atol=1e-12)
-    off = np.hypot(np.hypot(local[:, 0], local[:, 1]), np.maximum(np.abs(local[:, 2]) - hull.half, 0.0))
-    assert float(off.max()) <= hull.radius
-    seen = directions(300)
-    gaps = hull.radius + hull.half * np.abs(seen[:, 2]) - (seen @ local.T).max(axis=1)
-    assert float(gaps.min()) >= -1e-12
-    # other directions than it was measured in: a few degrees of a radius more at most
-    assert float(gaps.max()) <= hull.overhang + 0.1 * (hull.radius + hull.half)
+    hull = Mesh("m", np.eye(4), points).hull
+    inside = rng.dirichlet(np.ones(count), 200) @ points - hull.centre
+    assert not hull.beyond(inside, 1e-9).any()
+    away = rng.normal(size=(50, 3))
+    assert hull.beyond(
+        away / np.linalg.norm(away, axis=1, keepdims=True) * 20.0 * np.abs(hull.corners).max(), 1e-3
+    ).all()
+    assert np.all(np.abs(hull.corners) <= hull.half + 1e-12)
+    seen = {0}
+    for _ in hull.corners:
+        seen |= {int(c) for k in seen for c in hull.rings[k]}
+    assert len(seen) == len(hull.corners)
 
 
 @settings(max_examples=60, deadline=None)
@@ -185,27 +187,34 @@ def test_a_capsule_holds_its_hull_and_its_overhang_is_as_stated(count: int, seed
 def test_what_is_proven_of_two_shapes_is_their_distance(seed: int, kind: int, keep: float) -> None:
     """Never more than coal finds; nearly as much where they are apart."""
     rng = np.random.default_rng(seed)
-    first = hull_of(rng.normal(size=(30, 3)) * 0.1)[0]
-    other = hull_of(rng.normal(size=(12, 3)) * 0.08)[0]
+    meshes = [Mesh(f"{n}", np.eye(4), rng.normal(size=(n, 3)) * size) for n, size in ((30, 0.1), (12, 0.08))]
     sizes = np.array([(0.0, 0.0, 0.0), rng.uniform(0.02, 0.2, 3)])
-    count = [0, len(first), len(first) + (len(other) if kind == HULL else 0)]
-    world = np.array([_random_pose(rng, 0.0), _random_pose(rng, 0.3)])
-    proven = hull_separation(
-        0, 1, keep, 1.0, np.array([HULL, kind]), sizes, np.concatenate([first, other]), np.array(count), world,
-        np.empty((6, 3)),
-    )  # fmt: skip
+    hulls = [mesh.hull for mesh in meshes]
+    start = len(hulls[0].corners)
+    rings = [*hulls[0].rings, *(ring + start for ring in hulls[1].rings)]
+    corners, firsts = np.concatenate([hull.corners for hull in hulls]), np.cumsum([0, *(len(ring) for ring in rings)])
+    axes, tips, proven = np.zeros((1, 3)), np.array([(0, start if kind == HULL else 0)]), -np.inf
+    places = [_random_pose(rng, 0.0), _random_pose(rng, 0.3)]
+    # what is remembered of another pose is no more than where to begin
+    for T in (*(_random_pose(rng, 0.3) for _ in range(int(rng.integers(3)))), places[1]):
+        world = np.array(
+            [
+                (places[0] @ se3.make(None, hulls[0].centre))[:3],
+                (T @ se3.make(None, hulls[1].centre) if kind == HULL else T)[:3],
+            ]
+        )
+        proven = hull_separation(
+            0, 0, 1, keep, 1.0, np.array([HULL, kind]), sizes, corners, firsts, np.concatenate(rings), world, axes,
+            tips, np.empty((14, 3)),
+        )  # fmt: skip
     a, b, c = sizes[1]
     shapes = {BOX: coal.Box(2 * a, 2 * b, 2 * c), CYLINDER: coal.Cylinder(a, 2 * b), SPHERE: coal.Sphere(a)}
-    second = Mesh("b", np.eye(4), other).geometry if kind == HULL else shapes[kind]
-    places = [coal.Transform3s(np.ascontiguousarray(T[:, :3]), T[:, 3]) for T in world]
+    second = meshes[1].geometry if kind == HULL else shapes[kind]
     truth = coal.distance(
-        Mesh("a", np.eye(4), first).geometry,
-        places[0],
-        second,
-        places[1],
-        coal.DistanceRequest(),
-        coal.DistanceResult(),
-    )
+        meshes[0].geometry, coal.Transform3s(places[0][:3, :3], places[0][:3, 3]),
+        second, coal.Transform3s(places[1][:3, :3], places[1][:3, 3]),
+        coal.DistanceRequest(), coal.DistanceResult(),
+    )  # fmt: skip
     assert proven <= truth + 1e-6
     if truth > max(keep, 1e-3):
         assert proven >= 0.99 * truth - 1e-6
@@ -255,4 +264,4 @@ def _halfspaces(corners: np.ndarray) -> np.ndarray:
 
 
 def _random_pose(rng: np.random.Generator, spread: float) -> np.ndarray:
-    return se3.make(se3.exp_so3(rng.normal(size=3)), rng.uniform(-spread, spread, 3))[:3]
+    return se3.make(se3.exp_so3(rng.normal(size=3)), rng.uniform(-spread, spread, 3))
