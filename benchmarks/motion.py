@@ -224,7 +224,7 @@ def main() -> None:
         return (few if quick else most), seeds[name]
 
     parts: dict[str, Callable[[], list[Row]]] = {
-        "ik": lambda: ik_rows(arms, 1000 if quick else 10_000, 20 if quick else 150),
+        "ik": lambda: ik_rows(arms, 1000 if quick else 20_000, 20 if quick else 150),
         "check": lambda: check_rows(both, home, 500 if quick else 5000),
         "table": lambda: single("table", table_problems(sides, home, *problems("table", 200, 30)), (1.0, 5.0)),
         "shelf": lambda: single("shelf", shelf_problems(sides, home, *problems("shelf", 100, 10)), (10.0, 50.0)),

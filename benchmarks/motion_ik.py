@@ -2,7 +2,7 @@
 """Inverse kinematics compared with peers: pinocchio's kinematics with the loop in Python, ikpy and mink. rad, m.
 
 Targets are tool poses of random configurations within the limits: uniform ones, and such with each joint, at a
-probability of 1/3, within 0.02 rad of a limit. A Panda and a UR5e are measured, too.
+probability of 1/3, within 0.02 rad of a limit. An OpenArm v2, a Panda and a UR5e are measured, too.
 """
 
 from __future__ import annotations
@@ -108,9 +108,9 @@ def _rows_of(metric: str, arm: IkArm, poses: Array, peer_count: int) -> list[Row
 
 
 def _others() -> dict[str, IkArm]:
-    """The robots of one arm."""
+    """The first arm of the other robots."""
     out: dict[str, IkArm] = {}
-    for name in ROBOTS:
+    for name in ("openarm_v2", *ROBOTS):
         description = RobotDescription.load(name)
         tool = description.tcp_link(description.arm_names[0])
         out[name] = IkArm(description, InverseKinematics(ArmKinematics(description, tool)))
