@@ -9,8 +9,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.exact import CollisionScene
 from openarm_motion.constraints.asked import CartesianGoal
 from openarm_motion.constraints.lines import ConstrainedLines
 from openarm_motion.kinematics.line import line_poses
@@ -22,6 +22,8 @@ from openarm_motion.timing.validation import validate_trajectory
 
 #: Greatest change of a joint between two points of a line, rad; the same between two branches is a jump.
 _MAX_STEP = 0.2
+#: A longer line is a mistake, m.
+_LONGEST = 10.0
 #: Fewest points of a line that can be timed, and the nearest that points are in time, s.
 _FEWEST = 7
 _SHORTEST = 0.002
@@ -40,15 +42,22 @@ def along(arm: Arm, now: StartState, goal: CartesianGoal, around: RequestBoxes) 
 
     Raises:
         PlanFailedError: IN_COLLISION, when the arm starts in collision.
+        OpenArmError: INVALID_ARGUMENT, for a way point out of all reach, or a constraint of a joint of another arm.
     """
     scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, environment=now.environment)
+    lines = ConstrainedLines(arm, scene, goal.path)
     if goal.avoid_collisions:
         arm.relax(scene, now.start)
     q, parts, done, ended = now.start, list[Trajectory](), 0.0, ""
     poses = [arm.kinematics.fk(now.start), *goal.waypoints]
+    for k, (a, b) in enumerate(pairwise(poses)):
+        if not float(np.linalg.norm(b[:3, 3] - a[:3, 3])) < _LONGEST:
+            x, y, z = b[:3, 3]
+            text = f"way point {k} at ({x:g}, {y:g}, {z:g}) m, expected less than {_LONGEST:g} m from the one before"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
     total = sum(float(line_poses(a, b)[1][-1]) for a, b in pairwise(poses))
     for pose in goal.waypoints:
-        part, way, share, ended = _segment(arm, now, scene, q, pose, goal)
+        part, way, share, ended = _segment(arm, now, lines, q, pose, goal)
         done += way
         if part is not None:
             parts.append(part)
@@ -61,7 +70,7 @@ def along(arm: Arm, now: StartState, goal: CartesianGoal, around: RequestBoxes) 
 
 
 def _segment(
-    arm: Arm, now: StartState, scene: CollisionScene, start: Array, pose: Array, goal: CartesianGoal
+    arm: Arm, now: StartState, lines: ConstrainedLines, start: Array, pose: Array, goal: CartesianGoal
 ) -> tuple[Trajectory | None, float, float, str]:
     """The longest part of one line: its trajectory, way, share of the line, and why it ends there."""
     poses, s = line_poses(arm.kinematics.fk(start), pose)
@@ -69,8 +78,8 @@ def _segment(
         return None, 0.0, 1.0, ""
     here = arm.inverse.classify(start)
     margin = max(0.0, min(arm.config.planning.joint_margin, arm.kinematics.margin(start)))
+    scene = lines.arms[0]
     jump = goal.revolute_jump or _MAX_STEP
-    lines = ConstrainedLines(arm, scene, goal.path)
     best: tuple[int, Array, str] = (0, start[None], "")
     for drift in LINE_DRIFTS if not np.isnan(here.swivel) else (0.0,):
         q, reached, why = arm.inverse.follow(poses, here, margin, jump, drift)

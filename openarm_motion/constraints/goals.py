@@ -30,9 +30,9 @@ def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0) -> lis
         scale: Of velocity, see `StartState`.
 
     Raises:
-        PlanFailedError: INVALID_ARGUMENT, for a joint of another arm; LIMITS; UNREACHABLE, with the reason.
+        OpenArmError: INVALID_ARGUMENT, for a joint of another arm; LIMITS; UNREACHABLE, with the reason.
     """
-    _check_joints(arm, region)
+    region.check(arm.names)
     if not region.positions and not region.orientations:
         return [_joints(arm, region, start)]
     limits, margin = arm.limits(scale), arm.config.planning.joint_margin
@@ -49,13 +49,6 @@ def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0) -> lis
     if first is not None and not why:
         why = "no configuration at the pose satisfies the other constraints"
     raise PlanFailedError(Code.UNREACHABLE, f"{arm.name} arm can't reach the goal: {why}", "goal")
-
-
-def _check_joints(arm: Arm, region: Region) -> None:
-    for interval in region.joints:
-        if interval.joint not in arm.names:
-            text = f"constraint of joint {interval.joint!r}; joints of the {arm.name} arm: {', '.join(arm.names)}"
-            raise PlanFailedError(Code.INVALID_ARGUMENT, text, "request")
 
 
 def _joints(arm: Arm, region: Region, start: Array) -> Array:

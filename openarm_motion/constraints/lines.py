@@ -30,11 +30,15 @@ class ConstrainedLines(LineChecks):
         arm: The arm.
         scene: What it keeps clear of.
         region: Where it stays.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a joint of another arm.
     """
 
     exact_only = True
 
     def __init__(self, arm: Arm, scene: CollisionScene, region: Region) -> None:
+        region.check(arm.names)
         self._arm, self._scene, self._region = arm, scene, region
         self.levers = scene.levers
 

@@ -66,7 +66,12 @@ def solve(arm: Arm, now: StartState, around: RequestBoxes, region: Region, *, av
 
 
 def judge(arm: Arm, now: StartState, around: RequestBoxes, region: Region) -> Verdict:
-    """Judge where an arm is."""
+    """Judge where an arm is.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a joint of another arm.
+    """
+    region.check(arm.names)
     scene = arm.scene(now.state, around.obstacles, around.attached, environment=now.environment)
     contacts = tuple(scene.contacts(now.start)) if scene.collides(now.start) else ()
     pose = arm.kinematics.fk(now.start)

@@ -135,6 +135,17 @@ class Region:
         """Whether anything is constrained."""
         return bool(self.joints or self.positions or self.orientations)
 
+    def check(self, names: Sequence[str]) -> None:
+        """Refuse joints that are not among these.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the joints there are.
+        """
+        for interval in self.joints:
+            if interval.joint not in names:
+                text = f"constraint of joint {interval.joint!r}; joints of the arm: {', '.join(names)}"
+                raise OpenArmError(Code.INVALID_ARGUMENT, text)
+
     def outside(self, names: Sequence[str], states: Array, poses: Array) -> list[tuple[str, Array]]:
         """How far configurations are outside, part by part.
 

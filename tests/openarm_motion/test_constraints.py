@@ -62,9 +62,16 @@ def test_an_interval_without_sense_is_refused_by_name() -> None:
 
 def test_a_goal_of_joints_of_another_arm_is_refused(arm, now) -> None:
     region = Region((JointInterval("openarm_left_joint1", 0.0, 0.1, 0.1),))
-    with pytest.raises(OpenArmError, match="openarm_left_joint1") as refused:
-        to_region(arm, now, RegionGoal((region,)), NOTHING)
-    assert refused.value.code is Code.INVALID_ARGUMENT
+    goal = Region((JointInterval(arm.names[0], 0.0, 2.0, 2.0),))
+    for ask in (
+        lambda: to_region(arm, now, RegionGoal((region,)), NOTHING),
+        lambda: to_region(arm, now, RegionGoal((goal,), region), NOTHING),
+        lambda: along(arm, now, CartesianGoal((arm.kinematics.fk(now.start),), path=region), NOTHING),
+        lambda: judge(arm, now, NOTHING, region),
+    ):
+        with pytest.raises(OpenArmError, match="openarm_left_joint1") as refused:
+            ask()
+        assert refused.value.code is Code.INVALID_ARGUMENT
 
 
 def test_the_end_of_a_plan_lies_in_the_region_and_the_nearer_of_two_is_taken(arm, now) -> None:
@@ -129,6 +136,14 @@ def test_a_cartesian_path_goes_through_its_way_points_and_ends_before_an_obstacl
     assert whole.v[-1] == pytest.approx(np.zeros(7))
     assert 0.0 <= part.fraction < 1.0
     assert "wall" in part.ended
+
+
+@pytest.mark.parametrize("z", [1e30, float("nan")])
+def test_a_way_point_out_of_all_reach_is_refused(arm, now, z: float) -> None:
+    T = arm.kinematics.fk(now.start)
+    T[2, 3] = z
+    with pytest.raises(OpenArmError, match="way point 0"):
+        along(arm, now, CartesianGoal((T,)), NOTHING)
 
 
 def test_a_state_is_judged_by_contacts_and_constraints(arm, now) -> None:

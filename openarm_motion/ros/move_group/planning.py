@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 #: Name of the planning pipeline.
 PIPELINE = "openarm"
+#: Longest planning time, s.
+_LONGEST = 120.0
 #: A joint state that names the present configuration to within this has no other one in mind, rad.
 _PRESENT = 1e-3
 
@@ -56,9 +58,11 @@ class Requests:
         self._check_pipeline(message.pipeline_id, message.planner_id)
         self._check_workspace(message.workspace_parameters)
         limit = message.allowed_planning_time
-        if not 0.0 <= limit < float("inf") or message.num_planning_attempts < 0:
+        if not 0.0 <= limit <= _LONGEST or message.num_planning_attempts < 0:
             text = f"allowed_planning_time is {limit:g} s and num_planning_attempts {message.num_planning_attempts}"
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}, expected numbers >= 0 (0: the default)")
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"{text}, expected numbers >= 0 (0: the default), at most {_LONGEST:g} s"
+            )
         goals = tuple(region for part in message.goal_constraints if (region := self._convert.region(part, arm)))
         if not goals:
             text = "goal_constraints has no constraint, expected at least one"
