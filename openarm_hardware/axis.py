@@ -13,6 +13,8 @@ from openarm_hardware.settings import Settings
 
 #: What an encoder may show beyond what the speed of a joint explains, of one reply to the next, rad.
 _ENCODER_SLACK = 0.05
+#: Torque that moves any joint against its friction, N m.
+_STICTION = 3.0
 _RANGES = (Register.PMAX, Register.VMAX, Register.TMAX)
 
 
@@ -46,6 +48,7 @@ class MotorAxis:
         self.share = 0.0
         self.asked = False
         self._target = (math.nan, 0.0)
+        self._stuck = max(settings.stuck, _STICTION / axis.kp) if axis.kp > 0.0 else math.inf
         #: Where the joint was when its reading last changed or was missing, and its command then.
         self._anchor = (math.nan, math.nan)
         self._left_s = 0.0
@@ -193,9 +196,9 @@ class MotorAxis:
 
     def dead(self) -> str:
         """Return why its position can't be true, by what was commanded since it changed last; else nothing."""
-        if self.axis.grips or not abs(self.command[0] - self._anchor[1]) > self._settings.stuck:
+        if self.axis.grips or not abs(self.command[0] - self._anchor[1]) > self._stuck:
             return ""
-        way = f"while its command went {self._settings.stuck:g} rad"
+        way = f"while its command went {self._stuck:.2g} rad"
         return f"{self.axis} stays at {self.q:.4f} {way}; is its encoder dead, or the joint blocked?"
 
     @property

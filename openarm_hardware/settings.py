@@ -19,7 +19,8 @@ class Settings:
         silent: A motor that leaves so many replies out in a row is lost.
         jump: Largest step of a joint's commands from one to the next, rad.
         tracking: Largest distance of a joint from its command, rad.
-        stuck: A joint whose reading stays the very same while its command moves by this has a dead encoder, rad.
+        stuck: A joint whose reading stays the very same while its command moves by this, and by what 3 N m
+            stand for, has a dead encoder, rad.
         slack: By so much a joint may be beyond its limits at the start, rad.
         posture: A joint that is this much elsewhere than when it was last seen has a wrong zero, rad.
         hot: Temperature of MOSFET or rotor at which the arm holds, °C.

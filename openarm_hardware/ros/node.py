@@ -19,7 +19,7 @@ from openarm_common.motors.bus import emulated_buses, open_bus
 from openarm_common.motors.wiring import Wiring, axes_of, load_wiring
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ArmLoad, ServoModel
-from openarm_common.ros.node import run
+from openarm_common.ros.node import run, until_shutdown
 from openarm_control.controller import RobotController
 from openarm_control.joints import JointReadout, arm_groups, arm_loads, carriers, gripper_groups, joint_names
 from openarm_control.pacing import RateDivider
@@ -107,12 +107,14 @@ class OpenArmHardware(ControlNode[HardwareNodeConfig]):
 
     def _publish(self, readout: JointReadout) -> None:
         """Publish a joint state, in the thread of the loop, whether the arms are commanded or not."""
-        self._states.publish_joints(readout)
-        if self._tf_ticks.due(readout.t_ns):
-            self._states.publish_tf(readout)
+        with until_shutdown(self.context):
+            self._states.publish_joints(readout)
+            if self._tf_ticks.due(readout.t_ns):
+                self._states.publish_tf(readout)
 
     def _observe(self, _: JointReadout) -> None:
-        self._controllers.publish_states()
+        with until_shutdown(self.context):
+            self._controllers.publish_states()
 
     def _store(self) -> None:
         state = self._driver.state
