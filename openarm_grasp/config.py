@@ -162,7 +162,7 @@ class CloudConfig(Config):
     margin: float = Field(
         default=0.004, ge=0.0, le=0.02, description="least room between an open finger and the object, m"
     )
-    table_clearance: float = Field(default=0.003, ge=0.0, le=0.02, description="hand over the table, m")
+    table_clearance: float = Field(default=0.0034, ge=0.0, le=0.02, description="hand over the table, m")
     pairs: int = Field(default=200, ge=10, le=2000, description="pairs of opposite contacts that are tried")
     poses: int = Field(default=2500, ge=100, le=100_000, description="poses of the hand that are tried")
     best: int = Field(default=60, ge=1, le=500, description="candidates that are offered to the planner")

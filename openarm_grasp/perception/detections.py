@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from openarm_common import se3
 from openarm_common.detection import Detection
@@ -26,6 +27,8 @@ from openarm_grasp.config import DetectConfig
 SAME_PLACE = 0.05
 #: Clouds of so many frames are enough.
 _CLOUDS = 3
+#: What lies this near to points of an object is a piece of it, m.
+_PIECE = 0.010
 #: An object of fewer points has no cloud.
 _LEAST_POINTS = 60
 
@@ -205,11 +208,18 @@ def find(
             f" {limits.match_radius * 1e3:.0f} mm of {_text(anchor.p_base)} in two thirds of them",
             anchor.p_base,
         )
-    spots = [d.p_base for d in track]
-    if len(clouds) == len(track) and not all(d.kind for d in track):
-        # the box around what is no prism changes with the noise, the middle of its points hardly does
-        spots = [cloud.points[cloud.labels == 1].mean(axis=0, dtype=np.float64) for cloud in clouds]
-    limit = limits.agree_within if all(d.kind for d in track) or not clouds else limits.shape_agrees_within
+    prism = all(d.kind for d in track) or len(clouds) < len(track)
+    if not prism:
+        # the box around what is no prism changes with the noise, the middle of its points hardly does; and in some
+        # frame a part of it may be missing
+        spots = np.array([cloud.points[cloud.labels == 1].mean(axis=0, dtype=np.float64) for cloud in clouds])
+        alike = np.linalg.norm(spots - np.median(spots, axis=0), axis=1) <= limits.shape_agrees_within
+        if 3 * np.count_nonzero(alike) >= 2 * len(track):
+            kept = np.flatnonzero(alike)
+            track, clouds, spots = [track[k] for k in kept], [clouds[k] for k in kept], spots[kept]
+    else:
+        spots = np.array([d.p_base for d in track])
+    limit = limits.agree_within if prism else 2.0 * limits.shape_agrees_within
     steps = [float(np.linalg.norm(a - b)) for a, b in pairwise(spots)]
     if steps and max(steps) > limit:
         raise UntrustedError(
@@ -219,8 +229,21 @@ def find(
             anchor.p_base,
         )
     target = average(track)
-    others = _others(frames, target, limits.match_radius)
-    return Sighting(target, others, frames[-1].t_ns, tuple(clouds[-_CLOUDS:]))
+    mine = [cloud.points[cloud.labels == 1] for cloud in clouds[-_CLOUDS:]]
+    shape = KDTree(np.concatenate(mine)) if mine else None
+    others = _others(frames, target, limits.match_radius, shape)
+    newest = tuple(_without_pieces(cloud, shape) for cloud in clouds[-_CLOUDS:])
+    return Sighting(target, others, frames[-1].t_ns, newest)
+
+
+def _without_pieces(cloud: LabelledCloud, shape: KDTree | None) -> LabelledCloud:
+    """A cloud as of `Sighting`, in which points of other detections that lie on the object belong to none."""
+    others = np.flatnonzero(cloud.labels == 2)
+    if shape is None or not len(others):
+        return cloud
+    labels = cloud.labels.copy()
+    labels[others[shape.query(cloud.points[others])[0] <= _PIECE]] = 0
+    return replace(cloud, labels=labels)
 
 
 def _labelled(frame: Frame, detection: Detection) -> LabelledCloud | None:
@@ -311,10 +334,17 @@ def on_table(d: Detection, table_z: float, *, reach: float = 0.03) -> Detection:
     return replace(d, T_base_object=T, size=np.array([d.size[0], d.size[1], height]))
 
 
-def _others(frames: Sequence[Frame], target: Detection, match_radius: float) -> tuple[Detection, ...]:
+def _others(
+    frames: Sequence[Frame], target: Detection, match_radius: float, shape: KDTree | None
+) -> tuple[Detection, ...]:
+    """Everything but the target; what lies on its points (`shape`) is a piece of it that was cut off in one frame."""
     found: list[Detection] = []
     for frame in reversed(frames):
-        for d in frame.detections:
+        for number, d in enumerate(frame.detections, start=1):
+            if shape is not None and frame.cloud is not None:
+                points = frame.cloud.points[frame.cloud.labels == number]
+                if len(points) and np.mean(shape.query(points)[0] <= _PIECE) > 0.5:
+                    continue
             # The middle of what is seen of an object may lie near another one.
             rivals = (k for k in (target, *found) if k.label == d.label or (k.measured and d.measured))
             if all(apart(d, known) > match_radius for known in rivals):

@@ -65,6 +65,8 @@ Options = dict[tuple[str, str], Option]
 def options_of(arm: str, offered: Sequence[GraspCandidate], target: Detection, limits: ApproachConfig) -> Options:
     """What an arm is offered, before it was planned; and the edges that the hand does not fit across."""
     found: Options = {(arm, c.id): Option(c.id, arm, c.score, c.parts) for c in offered}
+    if any(c.apertures is not None for c in offered):
+        return found  # on the cloud: there are no edges
     for name, width in wide_edges(target, limits):
         text = f"{width * 1e3:.0f} mm wide; the hand grasps sides up to {limits.max_width * 1e3:.0f} mm"
         found[arm, f"{target.label}/{name}"] = Option(f"{target.label}/{name}", arm, code=Code.TOO_WIDE, message=text)

@@ -30,6 +30,8 @@ from openarm_grasp.sampling.voxel_kernels import SHADOW, boundary
 _STARTS = 4
 #: Pairs are one when their middles are in one cell of this edge, voxels, and their axes in one sector, rad.
 _SAME_MIDDLE, _SAME_AXIS = 3.0, radians(12.0)
+#: Widths that pairs of are kept each, m: below, between and above.
+_WIDTHS = (0.012, 0.030, 0.055)
 #: Sine of the steepest closing axis.
 _LEAN = 0.5
 #: Contact along the pad, 0 its upper end: upright hands first, then all.
@@ -47,8 +49,8 @@ _WEIGHTS = {"contact": 1.5, "align": 10.0, "lever": -25.0, "aside": -10.0, "tilt
 _LEVER = 0.005
 #: A width this near to the widest begins to count, m; alignments count from here.
 _WIDE, _ALIGNED = 0.020, 0.9
-#: And a width may be larger by this share: what is steep is measured too narrow.
-_SLACK = 0.05
+#: And a width may be larger or smaller by this share: what is steep is measured too narrow, what is thin too wide.
+_SLACK = 0.08
 #: What a pair without an upright hand lost against one with it.
 _NOT_UPRIGHT = 1.0
 
@@ -179,7 +181,7 @@ class Search:
         edge = edge[surface.normals[tuple(edge.T)].any(axis=1)]
         # shuffled by a generator of its own, so that the same surface gives the same starts, spread over all of it
         starts = edge[np.random.default_rng(0).permutation(len(edge))[: _STARTS * most]]
-        out = np.empty((2 * len(starts), 8))
+        out = np.empty((4 * len(starts), 8))
         n = kernels.pairs(surface.cells, surface.normals, starts, _LEAN, self._widest, self._least_cos, out)
         pairs = out[:n]
         pairs[(pairs[:, 3] < 0.0) | ((pairs[:, 3] == 0.0) & (pairs[:, 4] < 0.0)), 3:6] *= -1.0
@@ -189,7 +191,13 @@ class Search:
         keys = keys[np.argsort(-out[:n, 7], kind="stable")] if n else keys
         _, first = np.unique(keys, axis=0, return_index=True)
         pairs = pairs[np.sort(first)]
-        return np.ascontiguousarray(pairs[np.argsort(-self._bound(pairs), kind="stable")][:most])
+        # the best of each width in turn: the rim of a mug has hundreds of pairs, its body a few
+        order = np.argsort(-self._bound(pairs), kind="stable")
+        width = np.digitize(pairs[order, 6] * surface.step, _WIDTHS)
+        rank = np.empty(len(order), np.int64)
+        for one in range(len(_WIDTHS) + 1):
+            rank[width == one] = np.arange(np.count_nonzero(width == one))
+        return np.ascontiguousarray(pairs[order[np.sort(np.argsort(rank, kind="stable")[:most])]])
 
     def _bound(self, pairs: Array) -> Array:
         """About the best score (p,) of a hand at each pair."""
@@ -276,7 +284,7 @@ class Search:
         area = float(row[k.TOUCH] * (pad[1] - pad[0]) * (pad[3] - pad[2]))
         # a voxel each way, and more at a side that was not seen; an object that turns in the hand gets narrower
         unsure = float(row[k.UNSEEN]) * step
-        least = max(float(row[k.NARROW]) * step - 2.0 * step, 0.0)
+        least = max((1.0 - _SLACK) * float(row[k.NARROW]) * step - 2.0 * step, 0.0)
         most = min(width * (1.0 + _SLACK) + 2.0 * step + unsure, 2.0 * self._shape.opening)
         return Antipodal(T, width, (least, most), area, float(row[k.TILT]), score, parts)
 

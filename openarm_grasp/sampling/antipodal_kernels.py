@@ -28,6 +28,8 @@ _GONE = 4
 _MOST_UNSEEN = 5
 #: Rays whose first contact is this near to the first of all say how the side of the object is turned, voxels.
 _FLAT = 4.0
+#: A hand that stands at its clearance over the table is this much above it, voxels.
+_ROUNDING = 0.05
 #: Rays that must touch each pad.
 _LEAST_TOUCH = 3.0
 
@@ -46,6 +48,29 @@ def _cell(cells: Bytes, x: float, y: float, z: float) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _pair(
+    cells: Bytes, normals: Floats, px: float, py: float, pz: float, dx: float, dy: float, dz: float, last: float,
+    widest: float, near: float, least_cos: float, out: Array, count: int,
+) -> int:  # fmt: skip
+    """Write the pair of a start and the end of the object at a distance from it, unless it is none.
+
+    Returns:
+        How many pairs there are.
+    """
+    if last < 0.5 or last > widest or count == out.shape[0]:
+        return count
+    qx, qy, qz = px + dx * last, py + dy * last, pz + dz * last
+    n = normals[math.floor(qx), math.floor(qy), math.floor(qz)]
+    far = n[0] * dx + n[1] * dy + n[2] * dz
+    if far < least_cos:
+        return count
+    row = out[count]
+    row[0], row[1], row[2] = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
+    row[3], row[4], row[5], row[6], row[7] = dx, dy, dz, last, min(near, far)
+    return count + 1
+
+
+@njit(cache=True, nogil=True)
 def pairs(cells: Bytes, normals: Floats, starts: Ints, lean: float, widest: float, least_cos: float, out: Array) -> int:
     """Find opposite contacts: from each start through the object, level and along the normal.
 
@@ -56,7 +81,7 @@ def pairs(cells: Bytes, normals: Floats, starts: Ints, lean: float, widest: floa
         lean: Closing axes that rise by more (sine) are left out.
         widest: Voxels.
         least_cos: Both normals are at most this far (cosine) from the closing axis: the friction cone.
-        out: (2 n, 8) rows: middle (3), closing axis (3), width, alignment.
+        out: (4 n, 8) rows: middle (3), closing axis (3), width, alignment.
 
     Returns:
         How many.
@@ -86,19 +111,13 @@ def pairs(cells: Bytes, normals: Floats, starts: Ints, lean: float, widest: floa
                     last, gone = at, 0
                 else:
                     gone += 1
-                    if gone > _GONE:
-                        break
+                    if gone == _GONE:
+                        count = _pair(cells, normals, px, py, pz, dx, dy, dz, last, widest, near, least_cos, out, count)
                 at += 0.5
-            if last < 0.5 or last > widest:
+            if gone < _GONE or last < 0.0:  # it goes on farther than the hand opens
                 continue
-            qx, qy, qz = math.floor(px + dx * last), math.floor(py + dy * last), math.floor(pz + dz * last)
-            far = normals[qx, qy, qz, 0] * dx + normals[qx, qy, qz, 1] * dy + normals[qx, qy, qz, 2] * dz
-            if far < least_cos:
-                continue
-            out[count, 0], out[count, 1], out[count, 2] = px + dx * last / 2, py + dy * last / 2, pz + dz * last / 2
-            out[count, 3], out[count, 4], out[count, 5] = dx, dy, dz
-            out[count, 6], out[count, 7] = last, min(near, far)
-            count += 1
+            # what is hollow has a wall beyond, and another pair across both
+            count = _pair(cells, normals, px, py, pz, dx, dy, dz, last, widest, near, least_cos, out, count)
     return count
 
 
@@ -224,6 +243,8 @@ def _touch(cells: Bytes, normals: Floats, T: Array, pad: Array, first: Array, la
                 cy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
                 cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
                 n = normals[math.floor(cx), math.floor(cy), math.floor(cz)]
+                if _cell(cells, cx, cy, cz - 1.0) in (SEEN, FILLED):  # the rim of what is flat is no slope
+                    n = normals[math.floor(cx), math.floor(cy), math.floor(cz) - 1]
                 count[side] += 1.0
                 for axis in range(3):
                     mean[side, axis] += n[axis]
@@ -312,7 +333,7 @@ def search(
     Returns:
         How many are good.
     """
-    count = 0
+    count, floor = 0, clearance - _ROUNDING
     T = np.eye(4)
     d, contact = np.empty(3), np.empty(COLUMNS)
     first, last = np.empty((_ACROSS, _ALONG)), np.empty((_ACROSS, _ALONG))
@@ -346,6 +367,7 @@ def search(
                 if short > 0.0:
                     away = short / -T[2, 2]
                     if away > 0.5 * (pad[3] - pad[2]):
+                        why[0] -= 1  # the same pose as with the contact nearer to the tip
                         why[2] += 1
                         ok = False
                         break
@@ -355,7 +377,7 @@ def search(
                     T[0, 3] -= away * T[0, 2]
                     T[1, 3] -= away * T[1, 2]
                     T[2, 3] -= away * T[2, 2]
-                if _hits(obstacles, hand, T, T[0, 3], T[1, 3], T[2, 3], clearance, 7) < 0:
+                if _hits(obstacles, hand, T, T[0, 3], T[1, 3], T[2, 3], floor, 7) < 0:
                     why[3] += 1
                     ok = False
                     break
@@ -400,7 +422,7 @@ def search(
         if contact[ALIGN] < least_cos:
             why[7] += 1
             continue
-        blind = _hits(obstacles, hand, T, T[0, 3], T[1, 3], T[2, 3], clearance, 1)
+        blind = _hits(obstacles, hand, T, T[0, 3], T[1, 3], T[2, 3], floor, 1)
         if blind < 0:
             why[3] += 1
             continue
@@ -408,7 +430,7 @@ def search(
         for n in range(1, steps + 1):
             far = min(4.0 * n, back)
             bx, by, bz = T[0, 3] - far * T[0, 2], T[1, 3] - far * T[1, 2], T[2, 3] - far * T[2, 2]
-            if _hits(obstacles, hand, T, bx, by, bz, clearance, 2) < 0:
+            if _hits(obstacles, hand, T, bx, by, bz, floor, 2) < 0:
                 ok = False
                 break
         if not ok:

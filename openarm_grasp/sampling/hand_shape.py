@@ -8,7 +8,7 @@ fingers, y the opening direction.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import ceil
 
@@ -58,20 +58,13 @@ class HandShape:
     starts: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
     @classmethod
-    def of(
-        cls,
-        robot: RobotDescription,
-        arm: str,
-        cameras: Iterable[CameraConfig] = (),
-        mounts: Mapping[str, Array] | None = None,
-    ) -> HandShape:
+    def of(cls, robot: RobotDescription, arm: str, cameras: Iterable[CameraConfig] = ()) -> HandShape:
         """Measure the hand of an arm.
 
         Args:
             robot: Whose.
             arm: Its name.
-            cameras: Those with a housing on the hand are part of it.
-            mounts: T_parent_link (4, 4) of cameras by name, as calibrated; others are at their nominal mounts.
+            cameras: At their mounts; those with a housing on the hand are part of it.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the robot has no hand, or its fingers no shape or no pads.
@@ -83,7 +76,7 @@ class HandShape:
             text = f"the fingers of arm {arm!r} of robot {robot.name!r} have no collision shapes: grasps need them"
             raise OpenArmError(Code.CONFIG_INVALID, text)
         rest = [corners for link, corners in opened if link not in robot.arm(arm).fingers]
-        rest += _housings(robot, arm, cameras, mounts or {})
+        rest += _housings(robot, arm, cameras)
         steps = np.linspace(0.0, hand.parts.opening, _STEPS)
         pads, tips = np.empty((_STEPS, 4)), np.empty((_STEPS, 16, 3))
         for n, finger in enumerate(steps):
@@ -147,9 +140,7 @@ def _box(edges: Array) -> Array:
     return (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * edges
 
 
-def _housings(
-    robot: RobotDescription, arm: str, cameras: Iterable[CameraConfig], mounts: Mapping[str, Array]
-) -> list[Array]:
+def _housings(robot: RobotDescription, arm: str, cameras: Iterable[CameraConfig]) -> list[Array]:
     """Corners (8, 3) of the housings that the hand carries, TCP frame."""
     beyond, found = _beyond(robot, arm), list[Array]()
     q = dict.fromkeys(robot.joints, 0.0)
@@ -157,7 +148,7 @@ def _housings(
         if camera.housing is None or camera.parent not in beyond:
             continue
         T_tcp_parent = se3.inverse(robot.link_pose(robot.tcp_link(arm), q)) @ robot.link_pose(camera.parent, q)
-        T = T_tcp_parent @ mounts.get(camera.name, camera.T_parent_link) @ camera.T_link_housing
+        T = T_tcp_parent @ camera.T_parent_link @ camera.T_link_housing
         found.append(se3.apply(T, _box(np.array(camera.housing))))
     return found
 

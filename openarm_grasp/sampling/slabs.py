@@ -6,10 +6,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from openarm_common import se3
 from openarm_common.types import Array
+from openarm_common.walls import wall_yaw
 from openarm_grasp.planning.candidates import Box
 
 #: A further box must save this share of the volume of the one about everything.
@@ -36,7 +36,7 @@ def slabs(label: str, points: Array, step: float, *, gap: float = 0.0, most: int
         gap: The boxes end this far above the lowest voxel, so that what stands on a table is not in collision with it.
         most: Boxes.
     """
-    R = se3.rot_z(_yaw(points[:, :2], step))
+    R = se3.rot_z(wall_yaw(points[:, :2], step))
     parts = [points @ R]
     least = _SAVED * _volume(parts[0], step)
     cuts = [_cut(parts[0], step)]
@@ -56,17 +56,6 @@ def slabs(label: str, points: Array, step: float, *, gap: float = 0.0, most: int
         name = f"target/{label}_{n}" if len(parts) > 1 else f"target/{label}"
         boxes.append(Box(name, se3.make(R, R @ (0.5 * (low + high))), high - low))
     return tuple(boxes)
-
-
-def _yaw(xy: Array, step: float) -> float:
-    """Turn of most walls of the footprint of points (n, 2), rad, to a quarter."""
-    cell = np.floor((xy - xy.min(axis=0)) / step).astype(np.int64) + 3
-    mask = np.zeros(cell.max(axis=0) + 4, np.float32)
-    mask[tuple(cell.T)] = 1.0
-    soft = gaussian_filter(mask, 1.5)
-    gx, gy = np.gradient(soft, axis=0), np.gradient(soft, axis=1)
-    walls = np.hypot(gx, gy) * np.exp(4.0j * np.arctan2(gy, gx))
-    return float(np.angle(walls.sum())) / 4.0
 
 
 def _volume(points: Array, step: float) -> float:

@@ -25,8 +25,9 @@ from openarm_grasp.sampling.voxel_kernels import FILLED, FREE, HIDDEN, SEEN, SHA
 VOXEL = 0.0025
 #: What stands farther from the target is no matter of a hand that grasps it, m.
 AROUND = 0.13
-#: Normals are those of the occupancy smoothed by this, voxels.
-_BLUR = 1.6
+#: Normals are those of the occupancy smoothed by this, voxels: along each axis; less along z, so that what is flat has
+#: sides. The direction of a plane does not depend on it.
+_BLUR = (1.6, 1.6, 0.7)
 #: Fewer points are no object.
 _LEAST_POINTS = 20
 #: An object that is larger is none that a hand grasps, m.
@@ -210,7 +211,7 @@ def _normals(cells: Bytes) -> Floats:
     part = (slice(low[0], high[0]), slice(low[1], high[1]), slice(0, high[2]))
     soft = solid[part].astype(np.float32)
     for axis, mode in ((0, "constant"), (1, "constant"), (2, "nearest")):
-        soft = gaussian_filter1d(soft, _BLUR, axis=axis, mode=mode, truncate=2.0)
+        soft = gaussian_filter1d(soft, _BLUR[axis], axis=axis, mode=mode, truncate=2.0)
     gradient = np.stack([-np.gradient(soft, axis=axis) for axis in range(3)], axis=-1)
     size = np.linalg.norm(gradient, axis=-1, keepdims=True)
     normals[part] = np.where(size > 1e-4, gradient / np.maximum(size, 1e-4), 0.0)

@@ -14,13 +14,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.shapes import judge_gone, judge_rests, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.perception.clouds import cluster_frames, cluster_of, object_points, points_near
-from openarm_grasp.perception.detections import Frame, apart
+from openarm_grasp.perception.detections import SAME_PLACE, Frame, apart
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.place import place_targets, placing_error
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
@@ -376,7 +377,13 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
         before = cluster_of(grasp.sighting)
         T_base_now = placed.target.T_base_tcp @ se3.inverse(grasp.candidate.T_base_tcp)
         rests = se3.apply(T_base_now, before.centroid)
-        return judge_rests(before, rests, cluster_frames(frames, rests), config.place.tolerance)
+        seen = judge_rests(before, rests, cluster_frames(frames, rests), config.place.tolerance)
+        torn = next((d for d in grasp.sighting.others if d.measured and _gone(d, frames)), None)
+        if seen.ok and torn is not None:
+            x, y = torn.p_base[:2]
+            text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
+            return CameraVerdict(Code.PLACE_FAILED, f"{text} is not known", final=True)
+        return seen
     error = placing_error(run.label, placed.target, frames[-1]) if frames else None
     if error is not None:
         run.task.session.drift.add(run.arm, *error)
@@ -384,3 +391,9 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
     height, footprint = (None, None) if run.size is None else (float(run.size[2]), run.size[:2])
     tolerance = config.place.tolerance
     return verdicts.judge_place(run.label, p_target, frames, tolerance, yaw, height, footprint)
+
+
+def _gone(other: Detection, frames: Sequence[Frame]) -> bool:
+    """Whether no frame shows anything where something stood next to an object."""
+    seen = [d for frame in frames for d in frame.detections]
+    return all(apart(d, other) > SAME_PLACE for d in seen) and bool(frames)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, cast
+from typing import TYPE_CHECKING, Any, Literal, Protocol, cast
 
 import cv2
 import numpy as np
@@ -21,6 +21,9 @@ from openarm_common.config import Config
 from openarm_common.detection import Described
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Mask
+
+if TYPE_CHECKING:
+    from openarm_perception.segmentation.clusters import Cluster
 
 Image = NDArray[np.uint8]
 
@@ -39,6 +42,7 @@ class Detection2D(Described):
         size: (width, height) of the box.
         mask: (height, width) bool, the pixels of the box that belong to the object.
         truncated: Whether the border of the image cuts it.
+        cluster: What the segmentation of depth says of it; None of what was found by colour or a network.
     """
 
     name: str
@@ -49,6 +53,7 @@ class Detection2D(Described):
     truncated: bool
     kind: str = ""
     color: str = ""
+    cluster: Cluster | None = None
 
     @property
     def origin(self) -> tuple[int, int]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -31,14 +32,13 @@ from openarm_perception.geometry import footprint, plane
 from openarm_perception.geometry.depth import DepthLimits, View
 from openarm_perception.geometry.patch import Patch, cut
 
+if TYPE_CHECKING:
+    from openarm_perception.segmentation.clusters import Cluster
+
 #: As many points of the sides as this are enough; tall objects show thousands.
 _SIDE_POINTS = 150
 #: What is robot to a larger share is no object on the table.
 _MOSTLY = 0.5
-#: So much of the outline in view is all of it; and so much parts the object from others, where depth has holes too.
-_ALL, _PARTED = 0.95, 0.7
-#: A prism is level in more than this share of its footprint.
-_LEVEL = 0.6
 #: Fewer pixels, without their border, are the fringe of the robot or of what it holds.
 _STICKS_OUT = 6
 
@@ -121,6 +121,8 @@ class Localizer:
         found = patch.found
         if found.truncated:
             raise _refusal(found, Code.BAD_IMAGE, " is cut by the border of the image; its size is unknown")
+        if found.cluster is not None:
+            return self._of_cluster(patch, found.cluster)
         height = next((self._heights[each] for each in found.attributes if each in self._heights), None)
         if height is not None and self._valid(patch).sum() < self.config.min_points:
             return self.locate_on_plane(found, height, patch.intrinsics, patch.T_base_camera)
@@ -134,18 +136,26 @@ class Localizer:
         flank = solid & (patch.points[..., 2] < top - patch.band)
         sides = patch.points[cv2.erode(flank.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, :2]
         sides = sides[:: max(1, len(sides) // _SIDE_POINTS)]
-        edges, visible, parted = self._edges(patch, face, flank, top)
+        edges, visible = self._edges(patch, face, flank, top)
         try:
             shape = footprint.fit(np.concatenate([edges, sides]), pixel)
+            if shape.rms > self.config.prism_rms:
+                shape = footprint.bound(patch.points[solid][:, :2], pixel)
         except OpenArmError as error:
-            # an outline that is in view is no prism's; one that something hides or touches may be
-            if visible < _ALL or parted < _PARTED:
-                raise _refusal(found, error.code, f": {error.message}") from error
-            shape = None
-        level = visible < _ALL or shape is None or _level_share(patch, face, shape, top) > _LEVEL
-        if shape is None or shape.rms > self.config.prism_rms or not level:
-            shape = _bound(patch, solid, pixel)
+            raise _refusal(found, error.code, f": {error.message}") from error
         return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
+
+    def _of_cluster(self, patch: Patch, cluster: Cluster) -> LocatedObject:
+        """Return what the segmentation has found out already: of a prism its shape, else the box around its points."""
+        found, outline, shape = patch.found, cluster.outline, cluster.shape.footprint
+        if (share := _share_of_robot(patch)) > _MOSTLY:
+            raise _robot(found, share)
+        if outline.cut:
+            raise _refusal(found, Code.NOTHING_DETECTED, f": its outline is cut by {outline.cut}")
+        T = cluster.T_frame_box
+        level = replace(shape, centre=T[:2, 3], yaw=math.atan2(T[1, 0], T[0, 0]) if shape.kind != "circle" else 0.0)
+        top = float((T @ (0.0, 0.0, 0.5 * cluster.size[2], 1.0))[2])
+        return self._detection(found, level, top, cluster.pixels, 1.0)
 
     def enclose(self, patch: Patch, withheld: OpenArmError | None = None) -> LocatedObject:
         """Enclose what is visible of a detection that cannot be measured, an obstacle. It is marked as not measured.
@@ -240,10 +250,8 @@ class Localizer:
         count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
         return labels == 1 + int(np.argmax(stats[1:count, cv2.CC_STAT_AREA]))
 
-    def _edges(self, patch: Patch, face: Mask, flank: Mask, top: float) -> tuple[Array, float, float]:
-        """Return points (n, 2) on the edges of the top, base frame, m, and which shares of its outline are in view.
-
-        The second of these is of what is an edge: where it touches another object of its height there is none.
+    def _edges(self, patch: Patch, face: Mask, flank: Mask, top: float) -> tuple[Array, float]:
+        """Return points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view.
 
         An edge lies between the face and what is far from it, or what belongs to the `flank`.
         """
@@ -273,8 +281,7 @@ class Localizer:
             # the face goes on down the flank as far as heights count as top
             height = np.where(ridge[edge], top - patch.band, top)
             found.append(camera[:2] + ray[:, :2] * ((height - camera[2]) / ray[:, 2])[:, None])
-        points = np.concatenate(found)
-        return points, seen / max(seen + hidden, 1), len(points) / max(seen + hidden, 1)
+        return np.concatenate(found), seen / max(seen + hidden, 1)
 
     def _detection(
         self, found: Detection2D, shape: footprint.Footprint, top: float, count: int, visible: float
@@ -293,30 +300,6 @@ class Localizer:
             found.name, found.score * visible, T, size, shape.kind == "circle", kind, color=found.color,
             source=found, covariance=covariance, points=count, visible=visible, method=shape.kind,
         )  # fmt: skip
-
-
-def _level_share(patch: Patch, face: Mask, shape: footprint.Footprint, top: float) -> float:
-    """Return which share of its footprint the top of a thing is level in: 1 of a prism, less of what bulges.
-
-    Args:
-        patch: Around it.
-        face: (h, w) pixels of its top.
-        shape: Its footprint.
-        top: Height of the top, m.
-    """
-    lens, above = patch.intrinsics, float(patch.T_base_camera[2, 3]) - top
-    # a pixel at depth z covers z^3 / (f^2 d) of a plane at the distance d
-    area = float((patch.z[face].astype(np.float64) ** 3).sum()) / (lens.fx * lens.fy * max(above, 1e-3))
-    filled = math.pi / 4.0 if shape.kind == "circle" else 1.0
-    return area / max(filled * float(np.prod(shape.size)), 1e-9)
-
-
-def _bound(patch: Patch, solid: Mask, pixel: float) -> footprint.Footprint:
-    """Return the rectangle around points, without those of the border, where a sensor reports any depth."""
-    inner = cv2.erode(solid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    if np.count_nonzero(inner) < 0.5 * np.count_nonzero(solid):
-        return footprint.bound(patch.points[solid][:, :2], pixel)
-    return footprint.bound(patch.points[inner][:, :2], 3.0 * pixel)
 
 
 def _shape(found: Detection2D, method: footprint.Kind) -> str:

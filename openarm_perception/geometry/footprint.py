@@ -15,8 +15,12 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from openarm_common.walls import wall_yaw
 
 Kind = Literal["rectangle", "circle", "bound"]
+
+#: Cells that the walls of a cloud are found in are no smaller, m.
+_CELL = 0.0025
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,7 @@ class Footprint:
     """What an object covers, seen from above.
 
     Attributes:
-        kind: `rectangle` or `circle`, fitted; `bound`: the smallest rectangle around what was seen.
+        kind: `rectangle` or `circle`, fitted; `bound`: the rectangle around what was seen.
         centre: (2,) m.
         yaw: Direction of the smaller extent, rad in (-pi/2, pi/2]; 0 for a circle.
         size: (smaller, larger) extent, m; the diameter twice for a circle.
@@ -69,15 +73,22 @@ def fit(outline: Array, spacing: float) -> Footprint:
 
 
 def bound(points: Array, spacing: float) -> Footprint:
-    """Return the smallest rectangle around points (n, 2), m: for what is neither rectangle nor circle."""
-    (cx, cy), (width, height), angle_deg = cv2.minAreaRect((points * 1e3).astype(np.float32))
-    yaw = math.radians(angle_deg) + (math.pi / 2.0 if width > height else 0.0)
-    # half a pixel is missing on every side that faces away from the camera
-    smaller, larger = (1e-3 * min(width, height) + spacing, 1e-3 * max(width, height) + spacing)
+    """Return the rectangle around points (n, 2), m, along most of its walls: for what is neither rectangle nor circle.
+
+    Args:
+        points: Seen ones, m.
+        spacing: That the rectangle is larger by, m: half a pixel is missing on every side that faces away.
+    """
+    yaw = wall_yaw(points, max(spacing, _CELL))
+    local = points @ _rotation(yaw)
+    low, high = local.min(axis=0), local.max(axis=0)
+    centre = _rotation(yaw) @ (0.5 * (low + high))
+    width, length = high - low
+    if width > length:
+        width, length, yaw = length, width, yaw + math.pi / 2.0
+    smaller, larger = float(width) + spacing, float(length) + spacing
     std = (0.1 * smaller, 0.1 * larger)
-    return Footprint(
-        "bound", np.array([cx, cy]) * 1e-3, _half_turn(yaw), (smaller, larger), 0.0, std, math.radians(10.0)
-    )
+    return Footprint("bound", centre, _half_turn(yaw), (smaller, larger), 0.0, std, math.radians(10.0))
 
 
 def _half_turn(yaw: float) -> float:

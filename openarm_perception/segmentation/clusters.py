@@ -15,6 +15,7 @@ from openarm_perception.geometry.depth import Points
 from openarm_perception.segmentation.background import nearer, noise_between
 from openarm_perception.segmentation.divide import SegmentationConfig, divide
 from openarm_perception.segmentation.outline import Outline, survey
+from openarm_perception.segmentation.parts import joined
 from openarm_perception.segmentation.shape import Shape, judge
 from openarm_perception.segmentation.support import Support, find_support
 
@@ -30,7 +31,7 @@ class Cluster:
         id: Its number in the label image.
         window: Rows and columns of the image around it.
         mask: (h, w) bool, its pixels within the window.
-        points: (n, 3) float32 of those pixels, in row order, m; base frame, or the camera's where
+        points: (n, 3) float32 of those pixels, without their noise, in row order, m; base frame, or the camera's where
             its pose is not known.
         height: Of its highest place over the support, m.
         outline: What lies beyond its outline.
@@ -83,6 +84,7 @@ def segment(
     T_base_camera: Array | None = None,
     robot: Mask | None = None,
     background: Points | None = None,
+    support: Support | None = None,
 ) -> Segmentation:
     """Find what stands on the table in the organised cloud of one camera.
 
@@ -95,47 +97,70 @@ def segment(
         robot: (h, w) pixels that show the robot or what it holds.
         background: (h, w, 3) as `points`, of the empty table or box; the support is found there, and what is no nearer
             than it is no thing.
+        support: What things stand on, where that is known.
 
     Raises:
         OpenArmError: BAD_IMAGE, for a background of another place; NOTHING_DETECTED, when there is no plane that things
             may stand on.
     """
     robot = np.zeros(points.shape[:2], np.bool_) if robot is None else robot
-    seen = np.where(robot[..., None], np.float32(np.nan), points) if background is None else background
-    support = find_support(seen, None if T_base_camera is None else T_base_camera[2, :3])
+    if support is None:
+        seen = np.where(robot[..., None], np.float32(np.nan), points) if background is None else background
+        support = find_support(seen, None if T_base_camera is None else T_base_camera[2, :3])
     apart = robot
     if background is not None:
         support = replace(support, noise=noise_between(points, background, support.noise))
         apart = robot | ~nearer(points, background, support.noise, config.sigmas, config.least_height)
     divided = divide(points, intrinsics, support, config, apart, rgb)
-    outlines = survey(divided.label, points, robot, support.noise)
-    pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
-    T_plane_camera = se3.make(np.stack([*support.axes.T, support.normal]), (0.0, 0.0, support.offset))
     T = np.eye(4) if T_base_camera is None else T_base_camera
-    T_frame_plane = T @ se3.inverse(T_plane_camera)
-    found: list[Cluster] = []
-    for i, outline in enumerate(outlines, start=1):
-        window = _window(divided.label, i)
-        mask = divided.label[window] == i
-        local = points[window]
-        z = local[..., 2]
-        other = ((divided.label[window] != 0) & ~mask) | robot[window]
-        depth = float(np.median(z[mask]))
+    image = _Image(points, divided.even, intrinsics, support, T, robot, rgb)
+    label, found = divided.label, image.clusters(divided.label)
+    if config.join_parts:
+        root = joined(found)
+        _, number = np.unique(root, return_inverse=True)
+        if len(found) and number.max() + 1 < len(found):
+            label = np.concatenate([[0], number + 1]).astype(np.uint16)[label]
+            found = image.clusters(label)
+    return Segmentation(label, found, support, divided.heights)
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """What clusters are described by; as the arguments of `segment`, and the points without noise."""
+
+    points: Points
+    even: Points
+    intrinsics: Intrinsics
+    support: Support
+    T_frame_camera: Array
+    robot: Mask
+    rgb: Bytes | None
+
+    def clusters(self, label: NDArray[np.uint16]) -> tuple[Cluster, ...]:
+        """Return the things 1, 2, … of a label image."""
+        support = self.support
+        outlines = survey(label, self.even, self.robot, support.noise)
+        T_plane_camera = se3.make(np.stack([*support.axes.T, support.normal]), (0.0, 0.0, support.offset))
+        return tuple(self._cluster(label, i, one, T_plane_camera) for i, one in enumerate(outlines, start=1))
+
+    def _cluster(self, label: NDArray[np.uint16], i: int, outline: Outline, T_plane_camera: Array) -> Cluster:
+        window, T = _window(label, i), self.T_frame_camera
+        mask, local, z = label[window] == i, self.even[window], self.points[window][..., 2]
+        other = ((label[window] != 0) & ~mask) | self.robot[window]
+        depth, lens = float(np.median(z[mask])), self.intrinsics
         shape = judge(
-            mask, other, z, _rays(intrinsics, window, T_plane_camera), support.offset, outline.cut, pixel * depth,
-            support.noise * depth * depth,
+            mask, other, z, _rays(lens, window, T_plane_camera), self.support.offset, outline.cut,
+            2.0 / (lens.fx + lens.fy) * depth,
         )  # fmt: skip
         T_plane_box = se3.make(se3.rot_z(shape.footprint.yaw), (*shape.footprint.centre, shape.height / 2.0))
         color = None
-        if rgb is not None:
-            r, g, b = (int(v) for v in np.median(rgb[window][mask], axis=0))
+        if self.rgb is not None:
+            r, g, b = (int(v) for v in np.median(self.rgb[window][mask], axis=0))
             color = (r, g, b)
         placed = local[mask] @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
         size = np.array([*shape.footprint.size, shape.height])
-        found.append(
-            Cluster(i, window, mask, placed, shape.height, outline, shape, T_frame_plane @ T_plane_box, size, color)
-        )
-    return Segmentation(divided.label, tuple(found), support, divided.heights)
+        T_frame_box = T @ se3.inverse(T_plane_camera) @ T_plane_box
+        return Cluster(i, window, mask, placed, shape.height, outline, shape, T_frame_box, size, color)
 
 
 def _window(label: NDArray[np.uint16], i: int) -> tuple[slice, slice]:

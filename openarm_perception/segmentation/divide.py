@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from openarm_common.camera.flying_pixels import label_lonely
 from openarm_common.config import Config
 from openarm_common.types import Array, Bytes, Mask
 from openarm_perception.geometry.depth import Points
+from openarm_perception.geometry.patch import denoise
 from openarm_perception.segmentation.colors import join_alike
 from openarm_perception.segmentation.grouping import partition
 from openarm_perception.segmentation.kernels import (
@@ -40,12 +41,17 @@ _GROWN_ON = 0.3
 _ALONG = 0.25
 #: What is nowhere wider than a pixel is the edge of something.
 _NARROW = 1.0
+#: Raised pixels this near to a thing, and to no other, are its own.
+_FILLED = 2
 
 
 class SegmentationConfig(Config):
     """What counts as a thing."""
 
     least_height: float = Field(default=0.004, gt=0.0, le=0.1, description="what is lower over the table is table, m")
+    faint: float = Field(
+        default=1.0, gt=0.0, le=1.0, description="share of that height which what goes on from a thing has at least"
+    )
     sigmas: float = Field(
         default=3.5, gt=0.0, le=10.0, description="and what is lower by as many standard deviations of the depth"
     )
@@ -59,6 +65,9 @@ class SegmentationConfig(Config):
     )
     join_colors: bool = Field(default=True, description="parts that touch and have the same plain colour are one thing")
     least_pixels: int = Field(default=60, ge=12, description="nor are pieces of fewer pixels")
+    join_parts: bool = Field(
+        default=False, description="pieces that touch are one thing, unless both are boxes or cylinders"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +77,13 @@ class Divided:
     Attributes:
         label: (h, w) uint16, 0: none; 1, 2, …: things, the largest (area) first.
         patch: (h, w) int32, the patches of surface that they are made of.
-        heights: (h, w) float32 over the support, m.
+        even: (h, w, 3) points without the noise of single pixels, optical frame, m.
+        heights: (h, w) float32 of those over the support, m.
     """
 
     label: NDArray[np.uint16]
     patch: Labels
+    even: Points
     heights: NDArray[np.float32]
 
 
@@ -97,8 +108,19 @@ def divide(
     pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
     noise = np.float32(support.noise)
     z = points[..., 2]
+    smooth, _ = denoise(z)
+    x, y = intrinsics.rays
+    even = np.stack([x * smooth, y[:, None] * smooth, smooth], axis=-1).astype(np.float32)
     heights = support.heights(points)
-    wanted = _above(points, heights, support, config) & ~_flying(z, pixel, support.noise) & ~apart
+    heights = support.heights(even)
+    # without the noise of single pixels, what is as low as that may be a thing
+    quiet = replace(support, noise=_noise_left(heights, smooth, support.noise))
+    raised = _connected(
+        _above(even, heights, quiet, config.faint * config.least_height, config.sigmas) & ~apart,
+        _above(even, heights, quiet, config.least_height, config.sigmas),
+    )
+    raised &= np.isfinite(z)
+    wanted = raised & ~_flying(z, pixel, support.noise)
     size = _patch_size(z[wanted], pixel, support.noise, config)
     broken = breaks(points, wanted, pixel, noise)
     strength = edge_strength(masked_normals(points, wanted, max(2, size // 2), noise), wanted, max(2, size // 2))
@@ -112,16 +134,42 @@ def divide(
     if rgb is not None and config.join_colors:
         root = join_alike(root, patch, border, rgb)
     number = _number(root, patch, area, moments, support, intrinsics, config)
-    return Divided(number[patch], patch, heights)
+    return Divided(_filled(number[patch], raised), patch, even, heights)
 
 
-def _above(points: Points, heights: NDArray[np.float32], support: Support, config: SegmentationConfig) -> Mask:
+def _filled(label: NDArray[np.uint16], raised: Mask) -> NDArray[np.uint16]:
+    """Return labels (h, w) that also have the raised pixels next to their own: holes, and those that float."""
+    for _ in range(_FILLED):
+        around = cv2.dilate(label, np.ones((3, 3), np.uint8))
+        label = np.where((label == 0) & raised, around, label)
+    return label
+
+
+def _connected(faint: Mask, clear: Mask) -> Mask:
+    """Return those pixels (h, w) that are faint and connected with a clear one."""
+    count, found = cv2.connectedComponents(faint.astype(np.uint8), connectivity=8)
+    label = np.asarray(found, np.int64)
+    with_clear = np.zeros(count, np.bool_)
+    with_clear[label[clear & faint]] = True
+    with_clear[0] = False
+    return with_clear[label]
+
+
+def _above(points: Points, heights: NDArray[np.float32], support: Support, least: float, sigmas: float) -> Mask:
     """Return which pixels (h, w) rise above the support by more than the noise."""
     with np.errstate(invalid="ignore", divide="ignore"):
         # noise acts along the ray; over a slanted plane it is less
         facing = np.abs(points @ support.normal.astype(np.float32)) / np.linalg.norm(points, axis=-1)
-        limit = np.float32(config.sigmas * support.noise) * points[..., 2] ** 2 * facing
-        return heights > np.maximum(np.float32(config.least_height), limit)
+        limit = np.float32(sigmas * support.noise) * points[..., 2] ** 2 * facing
+        return heights > np.maximum(np.float32(least), limit)
+
+
+def _noise_left(heights: NDArray[np.float32], z: Array, noise: float) -> float:
+    """Return the noise at 1 m, m, of the heights (h, w) of what is support; a warped image stays a noisy one."""
+    with np.errstate(invalid="ignore"):
+        off = heights[::4, ::4] / z[::4, ::4] ** 2
+        off = np.abs(off[np.abs(off) < 3.0 * noise])
+    return 1.4826 * float(np.median(off)) if len(off) else noise
 
 
 def _flying(z: NDArray[np.float32], pixel: float, noise: float) -> Mask:

@@ -102,6 +102,10 @@ def _survey(label: NDArray[np.uint16], points: Points, robot: Mask, noise: np.fl
                         step = max(_NEARER, 4.0 * noise * z * z)
                         if other < z - step:
                             found = _HIDDEN
+                            if label[j, i] == 0:  # what floats before it, or the thing itself hides a part of itself
+                                j += dv
+                                i += du
+                                continue
                         elif label[j, i] != 0 and other < z + step:
                             found = _TOUCHING
                         else:

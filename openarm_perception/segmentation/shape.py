@@ -27,7 +27,7 @@ _RMS = 0.0025
 _SIDE_STEP = 0.015
 #: Pixels of a thing, without which its depth is not smoothed.
 _FEW = 30
-#: So much of what is seen lies on a prism, within that distance of it, m, the noise and a pixel.
+#: So much of what is seen lies on a prism, within that distance of it, m, and a pixel.
 _SHARE, _NEAR = 0.9, 0.004
 
 
@@ -51,9 +51,7 @@ class Shape:
         return {"rectangle": "box", "circle": "cylinder"}.get(self.footprint.kind, "unknown")
 
 
-def judge(
-    mask: Mask, other: Mask, z: NDArray[np.float32], rays: Array, eye: float, hidden: str, pixel: float, noise: float
-) -> Shape:
+def judge(mask: Mask, other: Mask, z: NDArray[np.float32], rays: Array, eye: float, hidden: str, pixel: float) -> Shape:
     """Fit a prism to a thing.
 
     Args:
@@ -64,7 +62,6 @@ def judge(
         eye: Height of the camera over the plane, m.
         hidden: What cuts its outline; a prism is not fitted to what is seen in part.
         pixel: Distance of neighbouring pixels at its depth, m.
-        noise: Standard deviation of a depth there, m.
     """
     smooth, left = denoise(z.astype(np.float64))
     flat: Array = rays * smooth[..., None] + (0.0, 0.0, eye)
@@ -87,9 +84,15 @@ def judge(
         return Shape(around, top, "its top is neither rectangular nor round")
     if shape.rms > np.hypot(_RMS, 0.5 * pixel):
         return Shape(around, top, f"the outline of its top is {shape.rms * 1e3:.1f} mm (rms) from the nearest prism's")
-    share = _on_prism(flat[inner] if whole else points, shape, top, max(_NEAR, band) + noise + pixel)
+    seen = flat[inner] if whole else points
+    inside = _inside(seen, shape)
+    near, below = max(_NEAR, band) + pixel, seen[:, 2] < top - 2.0 * band
+    share = float(np.mean(((np.abs(seen[:, 2] - top) <= near) & (inside >= -near)) | (np.abs(inside) <= near)))
     if share < _SHARE:
         return Shape(around, top, f"{1.0 - share:.0%} of what is seen lies on no prism with its top")
+    wider = -float(np.median(inside[below])) if np.count_nonzero(below) >= _FEW else 0.0
+    if wider > _RMS:
+        return Shape(around, top, f"its sides are {wider * 1e3:.1f} mm out of the prism below its top")
     return Shape(shape, top, "")
 
 
@@ -118,13 +121,10 @@ def _edges(flat: Array, solid: Mask, other: Mask, rays: Array, top: float, eye: 
     return np.concatenate(found)
 
 
-def _on_prism(points: Array, shape: Footprint, top: float, near: float) -> float:
-    """Return the share of points (n, 3) within a distance of the top or the sides of a prism."""
+def _inside(points: Array, shape: Footprint) -> Array:
+    """Return how far points (n, 3) are inside of the sides of a prism, m; negative outside."""
     c, s = np.cos(shape.yaw), np.sin(shape.yaw)
     local = (points[:, :2] - shape.centre) @ np.array([[c, -s], [s, c]])
     if shape.kind == "circle":
-        inside = shape.size[0] / 2.0 - np.linalg.norm(local, axis=1)
-    else:
-        inside = (np.array(shape.size) / 2.0 - np.abs(local)).min(axis=1)
-    on_top = (np.abs(points[:, 2] - top) <= near) & (inside >= -near)
-    return float(np.mean(on_top | (np.abs(inside) <= near)))
+        return shape.size[0] / 2.0 - np.linalg.norm(local, axis=1)
+    return np.asarray((np.array(shape.size) / 2.0 - np.abs(local)).min(axis=1))

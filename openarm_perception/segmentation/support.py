@@ -30,6 +30,8 @@ _SAMPLES, _TRIES, _VOTERS = 20_000, 256, 2000
 _SHARE = 0.1
 #: A surface that things stand on is within this of level, where the direction up is known, rad.
 _STEEPEST = math.radians(25.0)
+#: A table is this near to where it is known to be, m, and as level as that, rad.
+_OFF, _TILT = 0.012, math.radians(2.0)
 #: Normals of points on the plane are within this of its own, rad.
 _NORMAL = math.radians(25.0)
 
@@ -147,7 +149,7 @@ def find_support(points: Points, up: Array | None = None) -> Support:
 
 
 def support_at(points: Points, T_base_camera: Array, height: float) -> Support:
-    """Return the level plane at a known height, with the noise that is measured at it.
+    """Return the plane next to a known height: that of the surface which is seen there, else the level one.
 
     Args:
         points: (h, w, 3) organised, optical frame, m; NaN where nothing was measured.
@@ -159,17 +161,26 @@ def support_at(points: Points, T_base_camera: Array, height: float) -> Support:
     step = max(1, math.ceil(math.sqrt(points.shape[0] * points.shape[1] / _SAMPLES)))
     seen = points[::step, ::step].reshape(-1, 3).astype(np.float64)
     seen = seen[np.isfinite(seen[:, 2])]
-    off = seen @ normal + offset
-    facing = np.abs(seen @ normal) / np.maximum(np.linalg.norm(seen, axis=1), 1e-6)
-    sigma = off / np.maximum(seen[:, 2] ** 2 * facing, 1e-6)
-    near = sigma[np.abs(off) <= 3.0 * FIRST_NOISE * np.maximum(seen[:, 2] ** 2, 0.5)]
-    # about the median: the height may be a little off
-    noise = 1.4826 * float(np.median(np.abs(near - np.median(near)))) if len(near) >= 12 else FIRST_NOISE
+    scale = np.maximum(seen[:, 2] ** 2 * np.abs(seen @ normal) / np.maximum(np.linalg.norm(seen, axis=1), 1e-6), 1e-6)
+    noise, near = FIRST_NOISE, seen[:0]
+    for band in (_OFF, 3.0, 3.0):
+        off = seen @ normal + offset
+        on = np.abs(off) <= (band if band == _OFF else band * np.maximum(noise * scale, 1e-3))
+        near = seen[on]
+        if len(near) < max(_SHARE * len(seen), 12):
+            break
+        # about the median: what stands on it is on one side
+        off = off[on] - np.median(off[on])
+        noise = float(np.clip(1.4826 * np.median(np.abs(off) / scale[on]), LEAST_NOISE, _MOST_NOISE))
+        middle = near.mean(axis=0)
+        tilted = np.linalg.eigh(np.cov((near - middle).T))[1][:, 0]
+        tilted *= np.sign(tilted @ normal)
+        if tilted @ normal > math.cos(_TILT):
+            normal, offset = tilted, -float(tilted @ middle)
     axes = _axes(normal)
     flat = seen @ axes
     hull = cv2.convexHull(flat.astype(np.float32))[:, 0].astype(np.float64) if len(flat) >= 3 else np.zeros((3, 2))
-    share = len(near) / max(len(seen), 1)
-    return Support(normal, offset, float(np.clip(noise, LEAST_NOISE, _MOST_NOISE)), hull, axes, share)
+    return Support(normal, offset, noise, hull, axes, len(near) / max(len(seen), 1))
 
 
 def _axes(normal: Array) -> Array:

@@ -10,6 +10,7 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.housings import mounted
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.sampling.hand_shape import HandShape
@@ -48,7 +49,7 @@ def test_a_housing_is_where_calibration_says():
     wrist = cameras["wrist"]
     mount = wrist.T_parent_link.copy()
     mount[:3, 3] += (0.02, 0.0, 0.0)
-    nominal, moved = (HandShape.of(robot, "right", [wrist], mounts) for mounts in ({}, {"wrist": mount}))
+    nominal, moved = (HandShape.of(robot, "right", mounted(cameras, to).values()) for to in ({}, {"wrist": mount}))
     q = dict.fromkeys(robot.joints, 0.0)
     T_tcp_parent = se3.inverse(robot.link_pose(robot.tcp_link("right"), q)) @ robot.link_pose(wrist.parent, q)
     middle = (T_tcp_parent @ wrist.T_parent_link @ wrist.T_link_housing)[None, :3, 3]

@@ -10,6 +10,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 from openarm_perception.segmentation.clusters import Segmentation, segment
+from openarm_perception.segmentation.divide import SegmentationConfig
 from openarm_perception.segmentation.grouping import group
 from openarm_perception.segmentation.support import find_support
 from openarm_perception.segmentation.views import merge_views
@@ -208,3 +209,26 @@ def test_the_same_image_gives_the_same_clusters(tabletop):
     assert np.array_equal(a.label, b.label)
     assert all(np.array_equal(x.T_frame_box, y.T_frame_box) for x, y in zip(a.clusters, b.clusters, strict=True))
     assert se3.is_pose(a.clusters[0].T_frame_box)
+
+
+def test_parts_that_touch_are_one_thing_for_a_hand_and_boxes_apart_are_two(tabletop):
+    handle = tabletop.Thing("red", "cylinder", (0.03, 0.03, 0.14), 0.25, 0.0, 0.0, lying=True)
+    head = tabletop.Thing("blue", "box", (0.05, 0.05, 0.06), 0.345, 0.0, 0.0)
+    alone = tabletop.Thing("green", "box", (0.05, 0.05, 0.06), 0.25, 0.18, 0.0)
+    view = tabletop.render([handle, head, alone])
+    points = seen(view, DepthNoiseConfig(enabled=True))
+    found = [
+        segment(
+            points,
+            view.intrinsics,
+            SegmentationConfig(join_parts=joined),
+            rgb=view.rgb,
+            T_base_camera=view.T_base_camera,
+        )
+        for joined in (False, True)
+    ]
+    apart, joined = (sorted(one.pixels for one in result.clusters) for result in found)
+    assert len(apart) == 3
+    assert len(joined) == 2
+    assert at(found[1], 0.25, 0.18).shape.kind == "box"
+    assert joined[1] > apart[2]

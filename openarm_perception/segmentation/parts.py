@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which clusters are parts of one thing: the neck of a bottle, the handle of a mug, both handles of scissors.
+
+Convexity cuts things at their notches. Whether two pieces that touch are one thing or two is not in a depth image; what
+is known of things in front of a hand is that they have a size. What was joined wrongly shows when it is lifted: a part
+of it stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from scipy.spatial import KDTree
+
+from openarm_common.types import Array, Ints
+
+if TYPE_CHECKING:
+    from openarm_perception.segmentation.clusters import Cluster
+
+#: Pieces touch where points of them are this near to each other, m, so many of them; two boxes need to be nearer.
+_TOUCH, _POINTS, _BOXES = 0.008, 4, 0.004
+#: Or where the one lies over the other: so much of it is within the other's outline, seen from above.
+_OVER, _ASKED = 0.3, 200
+#: What is joined is no larger than this, m: things that a hand grasps are long or wide, not both.
+_LONG, _WIDE = 0.38, 0.20
+
+
+def joined(clusters: Sequence[Cluster]) -> Ints:
+    """Return the group (n,) of each cluster: the index of its first one.
+
+    Args:
+        clusters: Of one image.
+    """
+    root = np.arange(len(clusters))
+    clouds = [one.points.astype(np.float64) for one in clusters]
+    pairs = [
+        (gap, i, j)
+        for i, a in enumerate(clusters)
+        for j, b in enumerate(clusters[:i])
+        if (gap := _gap(clouds[i], clouds[j])) <= (_TOUCH if "unknown" in (a.shape.kind, b.shape.kind) else _BOXES)
+    ]
+    for _, i, j in sorted(pairs):
+        one, other = root[i], root[j]
+        both = np.flatnonzero((root == one) | (root == other))
+        if one != other and _fits(np.concatenate([clouds[k] for k in both])):
+            root[both] = min(one, other)
+    return root
+
+
+def _gap(a: Array, b: Array) -> float:
+    """Return how far apart two clouds (n, 3) are, m; 0 where the one lies over the other."""
+    (few, many) = (a, b) if len(a) < len(b) else (b, a)
+    low, high = many.min(axis=0)[:2] - _TOUCH, many.max(axis=0)[:2] + _TOUCH
+    near = few[((few[:, :2] >= low) & (few[:, :2] <= high)).all(axis=1)]
+    if len(near) < _POINTS:
+        return np.inf
+    away, _ = KDTree(many).query(near, distance_upper_bound=2.0 * _TOUCH)
+    nearest = float(np.partition(away, _POINTS - 1)[_POINTS - 1])
+    if nearest <= _TOUCH:
+        return nearest
+    hull = cv2.convexHull((many[:, :2] * 1e3).astype(np.float32))
+    asked = near[:: max(1, len(near) // _ASKED)]
+    within = [cv2.pointPolygonTest(hull, (1e3 * float(x), 1e3 * float(y)), False) >= 0.0 for x, y, _ in asked]
+    return 0.0 if np.mean(within) * len(near) >= _OVER * len(few) else np.inf
+
+
+def _fits(points: Array) -> bool:
+    """Return whether points (n, 3) may be those of one thing, by their extent seen from above."""
+    _, (width, length), _ = cv2.minAreaRect((points[:, :2] * 1e3).astype(np.float32))
+    return max(width, length) <= 1e3 * _LONG and min(width, length) <= 1e3 * _WIDE
