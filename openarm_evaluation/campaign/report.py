@@ -20,6 +20,15 @@ _COLUMNS: Sequence[str] = (
     "attempts", "place_error_mm", "sim_s", "wall_s", "message", "again",
 )  # fmt: skip
 
+#: How far a grasp has come, by the state that it has entered.
+_STAGES = {
+    "seen": "TRANSFORM",
+    "grasps found": "PLAN",
+    "planned": "MOVE_TO_PREGRASP",
+    "held": "LIFT",
+    "lifted": "PLACE",
+}
+
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Sum up a campaign; times in simulated s.
@@ -69,7 +78,8 @@ def _things(rows: Sequence[Row]) -> dict[str, Any]:
     """Sum up objects of any shape; empty without any.
 
     `graspable` is the share that a hand can take at all, as the judge decides on the true meshes; `cleared` are those
-    of them that were placed, `of_object` the same by object; `refused` the codes of those that were not.
+    of them that were placed, `of_object` the same by object, `reached` how many of their grasps got how far; `refused`
+    the codes of those that were not.
     """
     found = [(row, name, thing) for row in rows for name, thing in row.get("things", {}).items()]
     if not found:
@@ -79,12 +89,22 @@ def _things(rows: Sequence[Row]) -> dict[str, Any]:
     by_object: dict[str, list[bool]] = defaultdict(list)
     for row, name, thing in can:
         by_object[Path(thing["object"]).name].append((id(row), name) in placed)
+    wanted = {(id(row), name) for row, name, _ in can}
+    tried = [g for row in rows for g in row["grasps"] if (id(row), g["target"]) in wanted]
     open_ = [g["code"] for row in rows if "things" in row for g in row["grasps"] if not g["placed"]]
     seconds = sum(float(row["sim_s"]) for row in rows if "things" in row)
     return {
         "graspable": interval(len(can), len(found)),
         "cleared": rate_of((id(row), name) in placed for row, name, _ in can),
         "of_object": {name: rate_of(outcomes) for name, outcomes in sorted(by_object.items())},
+        "reached": {
+            **{
+                what: sum(any(s["state"] == name for s in g.get("states", ())) for g in tried)
+                for what, name in _STAGES.items()
+            },
+            "placed": sum(bool(g["placed"]) for g in tried),
+            "claimed": sum(bool(g.get("claimed_success")) for g in tried),
+        },
         "refused": dict(Counter(open_).most_common()),
         "picks_per_hour": round(3600.0 * len(placed) / seconds) if seconds > 0.0 else None,
     }
@@ -166,6 +186,7 @@ def _figures_of_things(s: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         ("graspable, as judged on the true meshes", _rate(s["graspable"])),
         ("graspable ones placed", _rate(s["cleared"])),
+        ("grasps of graspable ones that got so far", ", ".join(f"{k} {v}" for k, v in s["reached"].items())),
         ("graspable ones not placed", ", ".join(missed) or "none"),
         ("answers where nothing was placed", ", ".join(f"{k}: {v}" for k, v in s["refused"].items()) or "none"),
         ("objects placed in an hour of robot time", str(s["picks_per_hour"] or "none")),

@@ -232,18 +232,7 @@ def find(
     mine = [cloud.points[cloud.labels == 1] for cloud in clouds[-_CLOUDS:]]
     shape = KDTree(np.concatenate(mine)) if mine else None
     others = _others(frames, target, limits.match_radius, shape)
-    newest = tuple(_without_pieces(cloud, shape) for cloud in clouds[-_CLOUDS:])
-    return Sighting(target, others, frames[-1].t_ns, newest)
-
-
-def _without_pieces(cloud: LabelledCloud, shape: KDTree | None) -> LabelledCloud:
-    """A cloud as of `Sighting`, in which points of other detections that lie on the object belong to none."""
-    others = np.flatnonzero(cloud.labels == 2)
-    if shape is None or not len(others):
-        return cloud
-    labels = cloud.labels.copy()
-    labels[others[shape.query(cloud.points[others])[0] <= _PIECE]] = 0
-    return replace(cloud, labels=labels)
+    return Sighting(target, others, frames[-1].t_ns, tuple(clouds[-_CLOUDS:]))
 
 
 def _labelled(frame: Frame, detection: Detection) -> LabelledCloud | None:

@@ -111,7 +111,6 @@ def divide(
     smooth, _ = denoise(z)
     x, y = intrinsics.rays
     even = np.stack([x * smooth, y[:, None] * smooth, smooth], axis=-1).astype(np.float32)
-    heights = support.heights(points)
     heights = support.heights(even)
     # without the noise of single pixels, what is as low as that may be a thing
     quiet = replace(support, noise=_noise_left(heights, smooth, support.noise))

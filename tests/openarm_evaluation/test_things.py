@@ -184,11 +184,16 @@ def test_figures_say_what_is_graspable_and_what_of_it_was_placed() -> None:
         row = crashed_row(task, RuntimeError("x")) | {"seed": k, "detector": "anything", "sim_s": 20.0}
         row["things"] = {"thing": {"object": f"/a/object_{k}", "side": 0, "why_not": why}}
         grasp = {"target": "thing", "placed": k == 0, "arm": "right", "code": "OK" if k == 0 else "TOO_WIDE"}
+        grasp["states"] = [{"state": state, "seconds": 1.0} for state in ("DETECT", "TRANSFORM", "PLAN")[: 3 - k]]
+        grasp["claimed_success"] = k == 0
         rows.append(row | {"grasps": [grasp | {"place_error_mm": 1.0, "sim_s": 20.0}]})
     s = report.summarise(rows)
     assert (s["graspable"]["count"], s["graspable"]["n"]) == (2, 3)
     assert (s["cleared"]["count"], s["cleared"]["n"]) == (1, 2)
     assert s["refused"] == {"TOO_WIDE": 2}
+    assert s["reached"] == {
+        "seen": 2, "grasps found": 1, "planned": 0, "held": 0, "lifted": 0, "placed": 1, "claimed": 1
+    }  # fmt: skip
     assert s["picks_per_hour"] == 60
     told = dict(
         report.figures(
