@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion: inverse kinematics, collision checks, plans, and a pose sent over ROS until its timed trajectory is back.
 
-    python benchmarks/motion.py [--quick] [--only PREFIX] [--json PATH]
+    [OPENARM_ROBOT=NAME] python -m benchmarks.motion [--quick] [--only PREFIX] [--json PATH]
 
 Problems are drawn from seeds that nothing was tuned on (`--tuning` takes those that were). On the table the arm knows
 the boxes only from the map that the suite's mapper makes of rendered images; elsewhere obstacles are boxes. A path
@@ -44,16 +44,17 @@ from benchmarks.report import Row, write_report
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import robot_work
 from openarm_common.types import Array
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.occupancy import Environment
-from openarm_motion.collision.solids import box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.dual_arm import DualArm
 from openarm_motion.planning.ompl_planner import OmplPlanner
 from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.rrt import FastPlanner
+from openarm_motion.service.motion_service import table_box
 
 #: A problem counts as feasible when some planner finds a path within this time, s.
 _LONG = 20.0
@@ -62,12 +63,14 @@ _CALLBACKS = "OMPL RRTConnect, our checks by Python callbacks"
 
 
 def arms_and_home() -> tuple[dict[str, Arm], dict[str, float]]:
-    """Both arms with the default table, and the robot's joints at home."""
+    """The arms of the process's robot with its table, and its joints at home."""
     description = with_housings(RobotDescription.load(), load_cameras().values())
-    table = box_from("table", (0.46, 0.0, 0.38), (0.7, 1.2, 0.04))
-    arms = {side: Arm(side, description, MotionConfig(), [table]) for side in ("left", "right")}
-    home = {**description.group_state("left_arm", "home"), **description.group_state("right_arm", "home")}
-    return arms, {**home, description.finger_joint("left"): 0.0, description.finger_joint("right"): 0.0}
+    table = table_box(robot_work().table)
+    arms = {name: Arm(name, description, MotionConfig(), [table]) for name in description.arm_names}
+    home = dict[str, float]()
+    for name in arms:
+        home |= description.group_state(f"{name}_arm", "home") | {description.finger_joint(name): 0.0}
+    return arms, home
 
 
 def plan_rows(
@@ -204,7 +207,7 @@ def main() -> None:
     args = parser.parse_args()
     quick, seeds = args.quick, TUNING if args.tuning else REPORTED
     arms, home = arms_and_home()
-    both, sides = DualArm(arms["left"], arms["right"]), list(arms.values())
+    sides = list(arms.values())
 
     def single(name: str, problems: list[Problem], targets: tuple[float, float]) -> list[Row]:
         def query(problem: Problem) -> PlanQuery:
@@ -216,22 +219,26 @@ def main() -> None:
 
         return plan_rows(name, problems, query, targets)
 
-    def dual(problem: Problem) -> PlanQuery:
-        scene = both.scene(problem.state, problem.boxes)
-        return both.query(scene, StartState(problem.state, problem.start, 0.5), problem.goals, 5.0)
-
     def problems(name: str, most: int, few: int) -> tuple[int, int]:
         return (few if quick else most), seeds[name]
 
     parts: dict[str, Callable[[], list[Row]]] = {
         "ik": lambda: ik_rows(arms, 1000 if quick else 20_000, 20 if quick else 150),
-        "check": lambda: check_rows(both, home, 500 if quick else 5000),
         "table": lambda: single("table", table_problems(sides, home, *problems("table", 200, 30)), (1.0, 5.0)),
         "shelf": lambda: single("shelf", shelf_problems(sides, home, *problems("shelf", 100, 10)), (10.0, 50.0)),
-        "dual": lambda: plan_rows("dual", dual_problems(both, home, *problems("dual", 100, 10)), dual, (5.0, 50.0)),
-        "ros": lambda: ros_rows(20 if quick else 200),
-        "moveit": lambda: moveit_rows(20 if quick else 200),
     }
+    if len(sides) == 2:
+        both = DualArm(*sides)
+
+        def dual(problem: Problem) -> PlanQuery:
+            scene = both.scene(problem.state, problem.boxes)
+            return both.query(scene, StartState(problem.state, problem.start, 0.5), problem.goals, 5.0)
+
+        parts |= {
+            "check": lambda: check_rows(both, home, 500 if quick else 5000),
+            "dual": lambda: plan_rows("dual", dual_problems(both, home, *problems("dual", 100, 10)), dual, (5.0, 50.0)),
+        }
+    parts |= {"ros": lambda: ros_rows(20 if quick else 200), "moveit": lambda: moveit_rows(20 if quick else 200)}
     rows = [row for name, part in parts.items() if name.startswith(args.only) for row in part()]
     write_report(rows, args.json)
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Planning problems on a table, in a shelf and for both arms, drawn from seeds. Base frame, m, rad."""
+"""Planning problems on a table, in a shelf and for both arms, drawn from seeds. Base frame, m, rad.
+
+They stand where the process's robot works: on its table, as far from it as its region of objects begins.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ import numpy as np
 from benchmarks.motion_map import rendered
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import robot_work
 from openarm_common.types import Array
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.solids import Box, box_from
@@ -23,7 +27,8 @@ from openarm_motion.planning.planner import Planner, PlanQuery
 #: Whether configurations collide that are free of everything else is asked of this.
 Collides = Callable[[Array], bool]
 
-TABLE_TOP = 0.40
+_WORK = robot_work()
+TABLE_TOP, _NEAR = _WORK.table.top_z, _WORK.region.x[0]
 _TRIES = 400
 #: Table-top problems to a rendered map.
 _A_MAP = 5
@@ -47,7 +52,7 @@ class Problem:
 def table_boxes(rng: np.random.Generator, count: int = 8) -> tuple[Box, ...]:
     """Boxes that stand on the table, some of them over each other's edges."""
     sizes = rng.uniform([0.04, 0.04, 0.08], [0.10, 0.12, 0.25], (count, 3))
-    x, y = rng.uniform(0.28, 0.62, count), rng.uniform(-0.45, 0.45, count)
+    x, y = rng.uniform(_NEAR + 0.12, _NEAR + 0.46, count), rng.uniform(-0.45, 0.45, count)
     return tuple(
         box_from(f"box{i}", (x[i], y[i], TABLE_TOP + 0.5 * sizes[i, 2] + 0.001), sizes[i]) for i in range(count)
     )
@@ -56,7 +61,7 @@ def table_boxes(rng: np.random.Generator, count: int = 8) -> tuple[Box, ...]:
 def shelf(rng: np.random.Generator) -> tuple[tuple[Box, ...], Array]:
     """A shelf of three by two cells on the table, open to the robot: its boards and the cells' middles (6, 3)."""
     thick, depth, height = 0.015, 0.22, float(rng.uniform(0.24, 0.30))
-    x0 = 0.40 + float(rng.uniform(-0.02, 0.02))
+    x0 = _NEAR + 0.24 + float(rng.uniform(-0.02, 0.02))
     y = np.array([-0.48, -0.16, 0.16, 0.48]) + rng.uniform(-0.03, 0.03, 4)
     z0 = TABLE_TOP + 0.002
     width, middle = float(y[-1] - y[0]), float(0.5 * (y[-1] + y[0]))
