@@ -135,7 +135,10 @@ class Trials:
                 placed.append(trial)
                 continue
             label = order.label_of(ask)
-            open_[order.left[-1] if order.left and order.left[-1].label == label else label] = trial
+            if order.left and order.left[-1].label == label:
+                open_.setdefault(order.left[-1], trial)  # that nothing else of the label is in view says nothing of it
+            else:
+                open_[label] = trial
             if touched and not clear:  # three attempts are what a scene may take
                 order.failed[label] = answer.message
         self._left, missing = order.faults(), len(labels) - len(placed)
