@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from openarm_common.errors import OpenArmError
-from openarm_hardware.cameras.source import CameraSource, Shot
+from openarm_hardware.cameras.source import CameraFrame, CameraSource
 
 #: A picture is waited for so long at a time; a camera that gave none for so long is opened again, s.
 _READ_S, _SILENT_S = 0.2, 2.0
@@ -27,14 +27,14 @@ class CameraFeed:
     Attributes:
         device: What it is, in words; empty while it is not open.
         fault: Why there are no pictures; empty: there are.
-        shots: Pictures so far.
+        frames: Pictures so far.
         opened: How often it was opened.
     """
 
-    def __init__(self, source: CameraSource, take: Callable[[Shot], None], silent_s: float = _SILENT_S) -> None:
+    def __init__(self, source: CameraSource, take: Callable[[CameraFrame], None], silent_s: float = _SILENT_S) -> None:
         self._source, self._take, self._silent_s = source, take, silent_s
         self.device, self.fault = "", "the camera is being opened"
-        self.shots = self.opened = 0
+        self.frames = self.opened = 0
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
 
@@ -71,11 +71,11 @@ class CameraFeed:
         """Hand on pictures until there are none; return whether there were any."""
         silent_s, found = 0.0, False
         while not self._ends.is_set():
-            shot = self._source.read(_READ_S)
-            if shot is not None:
+            frame = self._source.read(_READ_S)
+            if frame is not None:
                 silent_s, found, self.fault = 0.0, True, ""
-                self.shots += 1
-                self._take(shot)
+                self.frames += 1
+                self._take(frame)
                 continue
             silent_s += _READ_S
             if silent_s > self._silent_s:

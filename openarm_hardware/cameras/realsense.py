@@ -15,7 +15,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_hardware.cameras.config import RealsenseConfig
 from openarm_hardware.cameras.rectify import DistortionModel, Rectifier
-from openarm_hardware.cameras.source import Shot, Turn
+from openarm_hardware.cameras.source import CameraFrame, ImuReading
 
 _INSTALL = "install the extra `realsense`: .venv/bin/uv pip install --require-hashes -r requirements-realsense.lock"
 
@@ -92,7 +92,7 @@ class RealSense:
             raise OpenArmError(Code.NOT_READY, f"RealSense {config.serial or 'camera'}: {error}") from error
         return f"{name} {serial}{usb}"
 
-    def read(self, seconds: float) -> Shot | None:
+    def read(self, seconds: float) -> CameraFrame | None:
         """See `CameraSource.read`."""
         rs = self._rs
         try:
@@ -113,7 +113,7 @@ class RealSense:
         if abs(self._millimetres - 1.0) > 1e-6:
             distances = np.minimum(np.rint(distances * self._millimetres), 65535.0).astype(np.uint16)
         picture = self._rectifier.color(np.ascontiguousarray(pixels))
-        return Shot(t_ns, picture, self._rectifier.depth(distances), tuple(self._turned()))
+        return CameraFrame(t_ns, picture, self._rectifier.depth(distances), tuple(self._imu_readings()))
 
     def close(self) -> None:
         """See `CameraSource.close`."""
@@ -186,8 +186,8 @@ class RealSense:
                 self._open.append(sensor)
                 sensor.start(self._turns)
 
-    def _turned(self) -> Iterator[Turn]:
-        """Yield what the IMU has measured: each turn with the newest acceleration."""
+    def _imu_readings(self) -> Iterator[ImuReading]:
+        """Yield what the IMU has measured: each angular velocity with the newest acceleration."""
         rs = self._rs
         while frame := self._turns.poll_for_frame():
             motion = frame.as_motion_frame()
@@ -196,7 +196,7 @@ class RealSense:
             if motion.get_profile().stream_type() == rs.stream.accel:
                 self._acceleration = value
             elif self._acceleration is not None:
-                yield Turn(_stamp_ns(rs, motion), value, self._acceleration)
+                yield ImuReading(_stamp_ns(rs, motion), value, self._acceleration)
 
 
 def _by_sensor(chosen: tuple[tuple[Any, Any], ...]) -> list[tuple[Any, list[Any]]]:

@@ -14,7 +14,7 @@ from openarm_common.types import Array, Bytes
 
 
 @dataclass(frozen=True, eq=False)
-class Turn:
+class ImuReading:
     """One reading of an IMU: rad/s and m/s², (3,), in the frame of the IMU."""
 
     t_ns: int
@@ -23,20 +23,20 @@ class Turn:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """One picture without distortion.
+class CameraFrame:
+    """One rectified image.
 
     Attributes:
         t_ns: Wall clock at its exposure, by the best clock that the driver has.
         color: (h, w, 3) RGB.
-        depth: (h, w) mm, 0 where there is none, aligned to `color`; None of a camera without depth.
-        turns: What the IMU has measured since the last one.
+        depth: (h, w) mm, 0 where there is none, aligned to `color`; None for a camera without depth.
+        imu: What the IMU has measured since the last one.
     """
 
     t_ns: int
     color: Bytes
     depth: NDArray[np.uint16] | None = None
-    turns: tuple[Turn, ...] = ()
+    imu: tuple[ImuReading, ...] = ()
 
 
 class CameraSource(Protocol):
@@ -57,7 +57,7 @@ class CameraSource(Protocol):
         """Of its pictures, once it is open."""
         ...
 
-    def read(self, seconds: float) -> Shot | None:
+    def read(self, seconds: float) -> CameraFrame | None:
         """Return the next picture; None when none came in time.
 
         Raises:

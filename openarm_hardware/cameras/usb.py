@@ -16,7 +16,7 @@ from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_hardware.cameras.config import UsbConfig
 from openarm_hardware.cameras.rectify import Rectifier
-from openarm_hardware.cameras.source import Shot
+from openarm_hardware.cameras.source import CameraFrame
 
 
 class _Matrix(Config):
@@ -106,7 +106,7 @@ class UsbCamera:
             raise OpenArmError(Code.CONFIG_INVALID, text)
         return device
 
-    def read(self, seconds: float) -> Shot | None:
+    def read(self, seconds: float) -> CameraFrame | None:
         """See `CameraSource.read`; OpenCV waits for as long as its backend does."""
         if not self._capture.grab():
             raise OpenArmError(Code.NOT_READY, f"the camera {self._config.device} gives no picture; was it unplugged?")
@@ -114,7 +114,7 @@ class UsbCamera:
         good, picture = self._capture.retrieve()
         if not good:
             return None
-        return Shot(t_ns, self._rectifier.color(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)))  # pyright: ignore
+        return CameraFrame(t_ns, self._rectifier.color(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)))  # pyright: ignore
 
     def close(self) -> None:
         """See `CameraSource.close`."""

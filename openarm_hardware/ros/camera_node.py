@@ -15,7 +15,7 @@ from openarm_common.ros.convert import array_to_image, header, info_from_intrins
 from openarm_common.ros.node import QOS_SENSOR, BaseNode, until_shutdown
 from openarm_hardware.cameras.config import CameraNodeConfig
 from openarm_hardware.cameras.feed import CameraFeed
-from openarm_hardware.cameras.source import CameraSource, Shot
+from openarm_hardware.cameras.source import CameraFrame, CameraSource
 
 ConfigT = TypeVar("ConfigT", bound=CameraNodeConfig)
 
@@ -67,18 +67,18 @@ class CameraNode(BaseNode[ConfigT]):
         self._feed.close()
         super().close()
 
-    def _publish(self, shot: Shot) -> None:
+    def _publish(self, frame: CameraFrame) -> None:
         """Publish a picture, in the thread of the feed."""
         with until_shutdown(self.context):
-            self._publish_stream("color", shot.color, "rgb8", shot.t_ns)
-            if shot.depth is not None:
-                self._publish_stream("depth", shot.depth, "16UC1", shot.t_ns)
+            self._publish_stream("color", frame.color, "rgb8", frame.t_ns)
+            if frame.depth is not None:
+                self._publish_stream("depth", frame.depth, "16UC1", frame.t_ns)
             if self._imu is not None and _heard(self._imu):
-                for turn in shot.turns:
-                    message = Imu(header=header(f"{self.config.camera}_imu_optical_frame", turn.t_ns))
+                for reading in frame.imu:
+                    message = Imu(header=header(f"{self.config.camera}_imu_optical_frame", reading.t_ns))
                     message.orientation_covariance[0] = -1.0  # it knows none
-                    message.angular_velocity = vector(turn.gyro)
-                    message.linear_acceleration = vector(turn.acceleration)
+                    message.angular_velocity = vector(reading.gyro)
+                    message.linear_acceleration = vector(reading.acceleration)
                     self._imu.publish(message)
 
     def _publish_stream(self, kind: str, pixels: NDArray[np.generic], encoding: str, t_ns: int) -> None:
@@ -90,8 +90,13 @@ class CameraNode(BaseNode[ConfigT]):
 
     def _report(self) -> None:
         feed = self._feed
-        rate, self._before = (feed.shots - self._before) / self.REPORT_PERIOD_S, feed.shots
-        values = {"device": feed.device, "pictures": feed.shots, "pictures_per_s": f"{rate:.1f}", "opened": feed.opened}
+        rate, self._before = (feed.frames - self._before) / self.REPORT_PERIOD_S, feed.frames
+        values = {
+            "device": feed.device,
+            "pictures": feed.frames,
+            "pictures_per_s": f"{rate:.1f}",
+            "opened": feed.opened,
+        }
         slow = 0.0 < rate < 0.8 * self.config.rate
         if feed.fault or not slow:
             self.diagnose(not feed.fault, feed.fault or "running", **values)

@@ -18,7 +18,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_hardware.cameras.config import UsbConfig
 from openarm_hardware.cameras.feed import CameraFeed
 from openarm_hardware.cameras.rectify import Rectifier
-from openarm_hardware.cameras.source import Shot
+from openarm_hardware.cameras.source import CameraFrame
 from openarm_hardware.cameras.usb import UsbCamera
 
 pytestmark = pytest.mark.requirement("R-09")
@@ -66,11 +66,11 @@ def test_a_camera_is_read_in_rgb_with_the_optics_of_its_file_until_it_is_gone(tm
     camera = UsbCamera(usb(tmp_path, device=str(film(tmp_path))))
     camera.open()
     assert camera.intrinsics == OPTICS
-    shot = camera.read(1.0)
-    assert shot is not None
-    assert shot.depth is None
-    assert shot.color[30, 10, 2] > 200 > 60 > shot.color[30, 10, 0]
-    assert shot.color[30, 80, 0] > 200 > 60 > shot.color[30, 80, 2]
+    frame = camera.read(1.0)
+    assert frame is not None
+    assert frame.depth is None
+    assert frame.color[30, 10, 2] > 200 > 60 > frame.color[30, 10, 0]
+    assert frame.color[30, 80, 0] > 200 > 60 > frame.color[30, 80, 2]
     camera.read(1.0)
     camera.read(1.0)
     with pytest.raises(OpenArmError, match="was it unplugged"):
@@ -138,10 +138,10 @@ class Scripted:
         self.left = 2
         return "scripted"
 
-    def read(self, seconds: float) -> Shot | None:
+    def read(self, seconds: float) -> CameraFrame | None:
         if self.now == "good" or self.left > 0:
             self.left -= 1
-            return Shot(1, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+            return CameraFrame(1, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
         if self.now == "broken":
             raise RuntimeError("of a library")
         if self.now == "silent":
@@ -157,8 +157,8 @@ def test_a_camera_that_is_absent_unplugged_or_silent_is_opened_again() -> None:
     camera = Scripted(["absent", "broken", "unplugged", "silent"])
     faults = set[str]()
 
-    def take(shot: Shot) -> None:
-        came.append(shot)
+    def take(frame: CameraFrame) -> None:
+        came.append(frame)
         faults.add(feed.fault)
         if feed.opened == 4 and len(came) > 8:
             enough.set()

@@ -13,7 +13,7 @@ import pytest
 from openarm_common.errors import Code, OpenArmError
 from openarm_hardware.cameras.config import RealsenseConfig
 from openarm_hardware.cameras.realsense import RealSense, library
-from openarm_hardware.cameras.source import Shot
+from openarm_hardware.cameras.source import CameraFrame
 from tests.openarm_hardware.realsense_device import COLOR_F, HEIGHT, RATE, WIDTH, SoftwareRealSense
 
 try:
@@ -33,13 +33,13 @@ def camera_of(device: SoftwareRealSense, **values: object) -> RealSense:
     return RealSense(config(**values), lambda: [device.device])
 
 
-def seen(camera: RealSense, show: Callable[[], None]) -> Shot:
+def seen(camera: RealSense, show: Callable[[], None]) -> CameraFrame:
     """The first picture of what is shown."""
     end = time.monotonic() + 10.0
     while time.monotonic() < end:
         show()
-        if (shot := camera.read(0.2)) is not None:
-            return shot
+        if (frame := camera.read(0.2)) is not None:
+            return frame
     raise AssertionError("no picture")
 
 
@@ -49,12 +49,12 @@ def test_colour_depth_and_stamp_are_those_of_the_frames() -> None:
     assert "Software D435I 123456" in camera.open()
     depth = np.full((HEIGHT, WIDTH), 730, np.uint16)
     stamps = itertools.count(1_700_000_000_123_000_000, 33_000_000)
-    shot = seen(camera, lambda: device.show(COLOR, depth, next(stamps)))
-    np.testing.assert_array_equal(shot.color, COLOR)
-    assert (shot.t_ns - 1_700_000_000_123_000_000) % 33_000_000 < 1_000
+    frame = seen(camera, lambda: device.show(COLOR, depth, next(stamps)))
+    np.testing.assert_array_equal(frame.color, COLOR)
+    assert (frame.t_ns - 1_700_000_000_123_000_000) % 33_000_000 < 1_000
     assert (camera.intrinsics.fx, camera.intrinsics.width) == (COLOR_F, WIDTH)
-    assert shot.depth is not None
-    assert shot.depth[HEIGHT // 2, WIDTH // 2] == 730
+    assert frame.depth is not None
+    assert frame.depth[HEIGHT // 2, WIDTH // 2] == 730
     camera.close()
 
 
@@ -64,9 +64,9 @@ def test_depth_is_aligned_to_colour() -> None:
     camera.open()
     depth = np.full((HEIGHT, WIDTH), 500, np.uint16)
     depth[:, WIDTH // 2 + 8 :] = 900  # 8 pixels right of the middle by depth: 6 by colour
-    shot = seen(camera, lambda: device.show(COLOR, depth))
-    assert shot.depth is not None
-    row = shot.depth[HEIGHT // 2]
+    frame = seen(camera, lambda: device.show(COLOR, depth))
+    assert frame.depth is not None
+    row = frame.depth[HEIGHT // 2]
     step = int(np.flatnonzero(row == 900)[0])
     assert step == pytest.approx(WIDTH / 2 + 6, abs=1)
     assert row[0] == 0, "the depth camera does not see so far to the left"
@@ -77,9 +77,9 @@ def test_depth_in_other_units_is_in_millimetres() -> None:
     device = SoftwareRealSense(unit=0.0001)
     camera = camera_of(device)
     camera.open()
-    shot = seen(camera, lambda: device.show(COLOR, np.full((HEIGHT, WIDTH), 7304, np.uint16)))
-    assert shot.depth is not None
-    assert shot.depth[HEIGHT // 2, WIDTH // 2] == 730
+    frame = seen(camera, lambda: device.show(COLOR, np.full((HEIGHT, WIDTH), 7304, np.uint16)))
+    assert frame.depth is not None
+    assert frame.depth[HEIGHT // 2, WIDTH // 2] == 730
     camera.close()
 
 
@@ -88,14 +88,14 @@ def test_distortion_is_taken_out() -> None:
     camera = camera_of(device)
     camera.open()
     ramp = np.repeat(np.arange(WIDTH, dtype=np.uint8)[None, :, None] * 3, HEIGHT, axis=0).repeat(3, axis=2)
-    shot = seen(camera, lambda: device.show(ramp, np.full((HEIGHT, WIDTH), 500, np.uint16)))
+    frame = seen(camera, lambda: device.show(ramp, np.full((HEIGHT, WIDTH), 500, np.uint16)))
     x = (np.arange(WIDTH) - (WIDTH - 1) / 2) / COLOR_F
     row = HEIGHT // 2
     for column in (10, 32, 50):  # what is seen at u lies at x (1 + k r²)
-        value = shot.color[row, column, 0] / 3.0
+        value = frame.color[row, column, 0] / 3.0
         found = (value - (WIDTH - 1) / 2) / COLOR_F
         assert found * (1.0 + 0.3 * found**2) == pytest.approx(x[column], abs=0.01)
-    assert abs(int(shot.color[row, 10, 0]) - int(ramp[row, 10, 0])) > 1
+    assert abs(int(frame.color[row, 10, 0]) - int(ramp[row, 10, 0])) > 1
     camera.close()
 
 
@@ -103,7 +103,7 @@ def test_the_imu_is_read_with_the_pictures() -> None:
     device = SoftwareRealSense()
     camera = camera_of(device)
     camera.open()
-    turns = []
+    imu = []
     depth = np.full((HEIGHT, WIDTH), 500, np.uint16)
 
     def show() -> None:
@@ -111,10 +111,10 @@ def test_the_imu_is_read_with_the_pictures() -> None:
         device.show(COLOR, depth)
 
     end = time.monotonic() + 10.0
-    while not turns and time.monotonic() < end:
-        turns += seen(camera, show).turns
-    np.testing.assert_allclose(turns[0].gyro, (0.1, 0.2, 0.3), atol=1e-6)
-    np.testing.assert_allclose(turns[0].acceleration, (0.0, -9.8, 0.1), atol=1e-6)
+    while not imu and time.monotonic() < end:
+        imu += seen(camera, show).imu
+    np.testing.assert_allclose(imu[0].gyro, (0.1, 0.2, 0.3), atol=1e-6)
+    np.testing.assert_allclose(imu[0].acceleration, (0.0, -9.8, 0.1), atol=1e-6)
     camera.close()
 
 
