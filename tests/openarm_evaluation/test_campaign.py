@@ -29,7 +29,7 @@ from openarm_evaluation.campaign.tasks.suites import SUITES, make_task
 from openarm_evaluation.campaign.tasks.task import FaultPlan
 from openarm_evaluation.campaign.tasks.things import THINGS
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.strategies.registry import carry_out
 from openarm_octomap.config import GridConfig
 from openarm_octomap.grid import OccupancyGrid
@@ -165,6 +165,27 @@ def test_tasks_come_from_set_and_seed_alone() -> None:
 
 def trials(task, tmp_path, **kwargs) -> trial.Trials:
     return trial.Trials(task, SimulatedSenses(depth_noise=False), GraspConfig(), folder=tmp_path, **kwargs)
+
+
+@pytest.mark.requirement("P-14")
+def test_a_refusal_keeps_its_reason_when_nothing_else_is_in_view(tmp_path, monkeypatch) -> None:
+    """The order asks for another object of the label, and there is none."""
+    run = trials(replace(make_task("nominal", 10001), labels=("anything",)), tmp_path)
+    answers = iter(
+        (
+            GraspOutcome(Code.TOO_WIDE, "90 mm, expected at most 80", "anything", object_position=(0.3, 0.1, 0.4)),
+            GraspOutcome(Code.UNKNOWN_OBJECT, "nothing is in view besides 1 that must stay", "anything"),
+        )
+    )
+
+    def grasp(ask: GraspRequest) -> trial.Trial:
+        answer = next(answers)
+        run._ends = (answer.place_position, answer.object_position)
+        return run._trial(ask.label, answer, (), 0.0)
+
+    monkeypatch.setattr(run, "_grasp", grasp)
+    row = run.run()
+    assert (row["code"], row["message"]) == ("TOO_WIDE", "90 mm, expected at most 80")
 
 
 @pytest.mark.requirement("R-01")
