@@ -78,7 +78,7 @@ def test_a_straight_line_stays_on_it(robot: tuple[Arm, np.ndarray]) -> None:
     np.testing.assert_allclose(p[-1], there[:3, 3], atol=1e-4)
 
 
-@pytest.mark.requirement("B-07")
+@pytest.mark.requirement("B-07", "R-30")
 @pytest.mark.parametrize("name", list(ROBOTS))
 def test_problems_are_solved_and_no_path_touches_the_triangles_of_the_meshes(name: str) -> None:
     arm = load_arm(name, touching=True)
