@@ -13,7 +13,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.constraints.asked import CartesianGoal
 from openarm_motion.constraints.lines import ConstrainedLines
-from openarm_motion.kinematics.line import line_poses
+from openarm_motion.kinematics.line import line_poses, line_way
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.moves import LINE_DRIFTS, RequestBoxes
@@ -22,8 +22,8 @@ from openarm_motion.timing.validation import validate_trajectory
 
 #: Greatest change of a joint between two points of a line, rad; the same between two branches is a jump.
 _MAX_STEP = 0.2
-#: A longer line is a mistake, m.
-_LONGEST = 10.0
+#: A longer way is a mistake, m.
+_LONGEST = 50.0
 #: Fewest points of a line that can be timed, and the nearest that points are in time, s.
 _FEWEST = 7
 _SHORTEST = 0.002
@@ -42,7 +42,7 @@ def along(arm: Arm, now: StartState, goal: CartesianGoal, around: RequestBoxes) 
 
     Raises:
         PlanFailedError: IN_COLLISION, when the arm starts in collision.
-        OpenArmError: INVALID_ARGUMENT, for a way point out of all reach, or a constraint of a joint of another arm.
+        OpenArmError: INVALID_ARGUMENT, for way points far apart, or a constraint of a joint of another arm.
     """
     scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, environment=now.environment)
     lines = ConstrainedLines(arm, scene, goal.path)
@@ -50,12 +50,10 @@ def along(arm: Arm, now: StartState, goal: CartesianGoal, around: RequestBoxes) 
         arm.relax(scene, now.start)
     q, parts, done, ended = now.start, list[Trajectory](), 0.0, ""
     poses = [arm.kinematics.fk(now.start), *goal.waypoints]
-    for k, (a, b) in enumerate(pairwise(poses)):
-        if not float(np.linalg.norm(b[:3, 3] - a[:3, 3])) < _LONGEST:
-            x, y, z = b[:3, 3]
-            text = f"way point {k} at ({x:g}, {y:g}, {z:g}) m, expected less than {_LONGEST:g} m from the one before"
-            raise OpenArmError(Code.INVALID_ARGUMENT, text)
-    total = sum(float(line_poses(a, b)[1][-1]) for a, b in pairwise(poses))
+    total = sum(line_way(a, b) for a, b in pairwise(poses))
+    if not total < _LONGEST:
+        text = f"the way through {len(goal.waypoints)} way points is {total:g} m long, expected less than {_LONGEST:g}"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
     for pose in goal.waypoints:
         part, way, share, ended = _segment(arm, now, lines, q, pose, goal)
         done += way

@@ -43,6 +43,12 @@ class Line:
         return Line(self.q[::-1].copy(), self.s[-1] - self.s[::-1])
 
 
+def line_way(T_a: Array, T_b: Array) -> float:
+    """Return the way of the tool from one pose to another, m; see `Line.s`."""
+    length = float(np.linalg.norm(T_b[:3, 3] - T_a[:3, 3]))
+    return length + ROTATION_LENGTH * se3.angle_between(T_a[:3, :3], T_b[:3, :3])
+
+
 def line_poses(T_a: Array, T_b: Array) -> tuple[Array, Array]:
     """Poses (m, 4, 4) from one to another, `STEP_M` and `STEP_RAD` apart at most, and the way (m,) to each."""
     length = float(np.linalg.norm(T_b[:3, 3] - T_a[:3, 3]))
@@ -54,7 +60,7 @@ def line_poses(T_a: Array, T_b: Array) -> tuple[Array, Array]:
         poses[:, :3, 3] += u[:, None] * (T_b[:3, 3] - T_a[:3, 3])
     else:
         poses = np.stack([se3.interpolate(T_a, T_b, float(x)) for x in u])
-    return poses, u * (length + ROTATION_LENGTH * turn)
+    return poses, u * line_way(T_a, T_b)
 
 
 def solve_line(

@@ -45,6 +45,9 @@ _FINENESS = (1.0, 4.0)
 _DIRECT = 4
 _SCOUTS = spread(16)
 
+#: Least scale of velocities and accelerations: a motion takes minutes, and not more memory than there is.
+_SLOWEST = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class ValidatedPlan:
@@ -279,16 +282,15 @@ class Arm(PlanningGroup):
         """Velocity scale of a request; 0 is the default.
 
         Raises:
-            OpenArmError: INVALID_ARGUMENT, when it is not 0 and not in (0, 1].
+            OpenArmError: INVALID_ARGUMENT, when it is neither 0 nor from `_SLOWEST` to 1.
         """
         if isinstance(requested, tuple):
             requested = requested[0]
         if requested == 0.0:
             return self.config.limits.default_scale
-        if not 0.0 < requested <= 1.0:
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT, f"velocity_scale is {requested}, expected 0 < scale <= 1 (or 0 for the default)"
-            )
+        if not _SLOWEST <= requested <= 1.0:
+            text = f"velocity_scale is {requested:g}, expected {_SLOWEST:g} to 1 (or 0 for the default)"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
         return requested
 
     def limits(self, scale: Scale) -> JointLimits:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -142,8 +144,17 @@ def test_a_cartesian_path_goes_through_its_way_points_and_ends_before_an_obstacl
 def test_a_way_point_out_of_all_reach_is_refused(arm, now, z: float) -> None:
     T = arm.kinematics.fk(now.start)
     T[2, 3] = z
-    with pytest.raises(OpenArmError, match="way point 0"):
+    with pytest.raises(OpenArmError, match=r"the way through 1 way points is .* long, expected less than 50"):
         along(arm, now, CartesianGoal((T,)), NOTHING)
+
+
+@pytest.mark.parametrize("scale", [(1e-9, 0.0), (0.0, 1e-9), (-1.0, 0.0), (float("nan"), 0.0)])
+def test_a_motion_that_would_take_days_is_refused(arm, now, scale: tuple[float, float]) -> None:
+    """Its trajectory would not fit into memory."""
+    T = arm.kinematics.fk(now.start)
+    T[2, 3] += 0.04
+    with pytest.raises(OpenArmError, match=r"_scale is .*, expected 0.001 to 1"):
+        along(arm, replace(now, scale=scale), CartesianGoal((T,)), NOTHING)
 
 
 def test_a_state_is_judged_by_contacts_and_constraints(arm, now) -> None:

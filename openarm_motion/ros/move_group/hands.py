@@ -66,7 +66,7 @@ class Hands:
         """A straight motion of the fingers to the joint goal of a request.
 
         Raises:
-            OpenArmError: for any other kind of goal; LIMITS.
+            OpenArmError: for any other kind of goal; LIMITS; INVALID_ARGUMENT, for a velocity scale that is none.
         """
         arm = self.groups[message.group_name]
         finger = self._description.finger_joint(arm)
@@ -85,7 +85,7 @@ class Hands:
         if finger not in state:
             raise OpenArmError(Code.NOT_READY, f"/joint_states lacks {finger}")
         ends = np.array([[state[finger]], [position]])
-        share = message.max_velocity_scaling_factor or 1.0
+        share = self._service.arms[arm].scale(message.max_velocity_scaling_factor or 1.0)
         duration = max(_SHORTEST, float(np.ptp(ends)) / (self._config.finger_speed * share))
         return Motion((finger,), np.array([0.0, duration]), ends, np.zeros((2, 1)), np.zeros((2, 1)))
 

@@ -137,6 +137,11 @@ def test_refused_moves_say_why(bench) -> None:
             "velocity_scale is 1.5",
         ),
         (
+            MoveArm.Goal(arm="right", kind=3, named="home", velocity_scale=1e-9),
+            "INVALID_ARGUMENT",
+            "velocity_scale is 1e-09, expected 0.001 to 1",
+        ),
+        (
             bench.named(obstacles=[CollisionBox(id="flat", size=Vector3(x=0.1, y=0.1, z=0.0))]),
             "INVALID_ARGUMENT",
             "box 'flat' has size",
