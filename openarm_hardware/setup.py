@@ -15,5 +15,11 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
     ],
     install_requires=["setuptools"],
-    entry_points={"console_scripts": ["openarm_hardware = openarm_hardware.ros.node:main"]},
+    entry_points={
+        "console_scripts": [
+            "openarm_hardware = openarm_hardware.ros.node:main",
+            "realsense_camera = openarm_hardware.ros.realsense_camera:main",
+            "usb_camera = openarm_hardware.ros.usb_camera:main",
+        ]
+    },
 )

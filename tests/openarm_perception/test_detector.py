@@ -141,9 +141,12 @@ def test_policies_rank_by_score_or_by_distance_from_the_centre() -> None:
 
 @pytest.mark.requirement("B-03")
 def test_a_detection_in_the_image_holds_no_position_in_space() -> None:
-    """Pixels and metres are different types: a 2-D detection has no depth, no frame, nothing to take for a position."""
+    """Pixels and metres are different types: a 2-D detection has no depth, no frame, nothing to take for a position.
+
+    A detector of depth hands on the cluster that it segmented, whole.
+    """
     names = {f.name for f in dataclasses.fields(Detection2D)}
-    assert names == {"name", "color", "kind", "score", "centre", "size", "mask", "truncated"}
+    assert names == {"name", "color", "kind", "score", "centre", "size", "mask", "truncated", "cluster"}
 
 
 @pytest.mark.parametrize(
