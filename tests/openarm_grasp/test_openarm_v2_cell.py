@@ -30,7 +30,7 @@ def test_it_places_an_object_of_its_scene(monkeypatch: pytest.MonkeyPatch, camer
     (grasp,) = trials.run()["grasps"]
     assert (grasp["outcome"], grasp["arm"], grasp["attempts"]) == ("placed", side, 1), grasp["message"]
     assert grasp["place_error_mm"] < 8.0
-    assert f"the {side}_wrist camera sees it" in " ".join(step.reason for step in trials.steps)
+    assert f"observing with the {side}_wrist camera" in " ".join(step.reason for step in trials.steps)
 
 
 @pytest.mark.requirement("R-05")
