@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """How evenly the servo process commands sixteen motors on two buses, and how soon it stops them.
 
-    python -m benchmarks.can_loop [--seconds 10] [--trials 30] [--load 1] [--rates 250,500] [--beside sim] [--json PATH]
+    python -m benchmarks.can_loop [--seconds 10] [--trials 30] [--load 1] [--rates 250,500] [--graph sim] [--json PATH]
 
 Buses are local sockets to a process of emulated motors, so no figure has the time of an adapter, its driver or a wire
 in it. Each row of SCHED_FIFO has the same loop under SCHED_OTHER as its peer. Periods are of a histogram of 0.1 ms.
-With --beside, a graph runs meanwhile in which one pick follows the other, in place of busy processes.
+With --graph, a graph runs meanwhile in which one pick follows the other, in place of busy processes.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def load(n: int) -> Iterator[None]:
 
 
 @contextmanager
-def beside(graph: str) -> Iterator[None]:
+def next_to(graph: str) -> Iterator[None]:
     """Run a graph that picks."""
     openarm = [sys.executable, "-m", "openarm_bringup.cli"]
     domain = ["--domain", str(reserve_domain())]
@@ -167,7 +167,7 @@ def beside(graph: str) -> Iterator[None]:
     def pick() -> None:
         while not ends.is_set():
             done = subprocess.run([*openarm, "pick", "red", *domain], capture_output=True, text=True, check=False)
-            print("beside:", (done.stdout + done.stderr).strip()[:160].replace("\n", " "), flush=True)
+            print("pick:", (done.stdout + done.stderr).strip()[:160].replace("\n", " "), flush=True)
 
     picks = threading.Thread(target=pick, daemon=True)
     try:
@@ -253,20 +253,20 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--trials", type=int, default=30)
     parser.add_argument("--load", type=int, default=1, help="busy processes that run meanwhile")
-    parser.add_argument("--beside", default="", help="a graph that runs meanwhile")
+    parser.add_argument("--graph", default="", help="a graph that runs meanwhile")
     parser.add_argument("--rates", default="250,500", help="of the loop, Hz")
     parser.add_argument("--silent", type=int, default=3, help="replies left out that stop an arm")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     rows = list[Row]()
     rates = [float(rate) for rate in options.rates.split(",")]
-    busy = f"the graph {options.beside}" if options.beside else f"{options.load} busy processes"
-    with beside(options.beside) if options.beside else load(options.load):
+    busy = f"the graph {options.graph}" if options.graph else f"{options.load} busy processes"
+    with next_to(options.graph) if options.graph else load(options.load):
         for rate in rates:
             fifo, other = (
                 measured(rate, kind, options.seconds, options.trials, options.silent) for kind in (True, False)
             )
-            print(f"{rate:g} Hz: {fifo.scheduling}, beside it {other.scheduling}; next to {busy}")
+            print(f"{rate:g} Hz: {fifo.scheduling}; the other: {other.scheduling}; next to {busy}")
             n, peer = round(rate * options.seconds), other.scheduling
             target = 4.5 if rate == 250.0 else None
             rows += [

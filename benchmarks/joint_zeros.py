@@ -181,7 +181,7 @@ def main() -> None:
     description = RobotDescription.load()
     away: dict[str, list[float]] = {}
     sigma: dict[str, list[float]] = {}
-    told: dict[str, list[bool]] = {}
+    observable: dict[str, list[bool]] = {}
     nees: dict[str, list[float]] = {}
     seconds: list[float] = []
     for number in range(sets):
@@ -189,18 +189,18 @@ def main() -> None:
         begin = time.thread_time()
         found = solved(description, made)
         seconds.append(time.thread_time() - begin)
-        for name, value, deviation, seen in zip(found.names, found.values, found.sigma, found.told, strict=True):
+        for name, value, deviation, seen in zip(found.names, found.values, found.sigma, found.observable, strict=True):
             away.setdefault(name, []).append(value - made.zeros[name])
             sigma.setdefault(name, []).append(deviation)
-            told.setdefault(name, []).append(seen)
+            observable.setdefault(name, []).append(seen)
         for name, value in groups(found, made).items():
             nees.setdefault(name, []).append(value)
     seen_errors: list[float] = []
     for name, errors in away.items():
         rms, predicted = math.degrees(np.sqrt(np.mean(np.square(errors)))), math.degrees(np.mean(sigma[name]))
-        told_in = sum(told[name])
-        seen_errors += [error for error, seen in zip(errors, told[name], strict=True) if seen]
-        print(f"{name:24s} rms {rms:.4f}°  predicted {predicted:.4f}°  told in {told_in} of {sets} sets")
+        observable_in = sum(observable[name])
+        seen_errors += [error for error, seen in zip(errors, observable[name], strict=True) if seen]
+        print(f"{name:24s} rms {rms:.4f}°  predicted {predicted:.4f}°  observable in {observable_in} of {sets} sets")
     for name, values in nees.items():
         print(f"nees {name:24s} {np.mean(values):.2f}")
     worst = max((float(np.mean(values)) for values in nees.values()), key=lambda value: abs(value - 6.0))

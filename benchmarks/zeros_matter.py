@@ -148,7 +148,7 @@ def main() -> None:
     description = RobotDescription.load()
     tcp: dict[tuple[str, str, str], list[Array]] = {}
     found_off: list[float] = []
-    told = 0
+    observable = 0
     placed: dict[tuple[str, str], list[tuple[bool, float]]] = {}
     for seed in range(arguments.first, arguments.first + seeds):
         robot = made(seed)
@@ -156,7 +156,7 @@ def main() -> None:
         after = {mount.camera: mount.T_parent_link for mount in found.mounts}
         belief = description.with_zeros(found.zeros.offsets)
         seen = [name for name in found.zeros.offsets if name not in found.zeros.by_prior]
-        told += len(seen)
+        observable += len(seen)
         found_off += [found.zeros.offsets[name] - robot.offsets[name] for name in seen]
         worst = max((abs(found.zeros.offsets[name] - robot.offsets[name]) for name in seen), default=math.nan)
         line = [f"seed {seed:2d}: {len(seen)} zeros seen, worst {math.degrees(worst):.3f}°"]
@@ -174,8 +174,10 @@ def main() -> None:
             with in_use(found.zeros.offsets):
                 placed.setdefault((arm, "after"), []).append(place(seed, arm, after))
     rows = [
-        Row("zeros_rms", math.degrees(float(np.sqrt(np.mean(np.square(found_off))))), "deg", "lower", 0.05, n=told),
-        Row("zeros_seen", told / seeds, "joints", "higher", None, n=seeds),
+        Row(
+            "zeros_rms", math.degrees(float(np.sqrt(np.mean(np.square(found_off))))), "deg", "lower", 0.05, n=observable
+        ),
+        Row("zeros_seen", observable / seeds, "joints", "higher", None, n=seeds),
     ]
     for arm in description.arm_names:
         for frame in ("base", "camera"):

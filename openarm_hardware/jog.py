@@ -48,7 +48,7 @@ class Jogged:
 
 
 class Jog:
-    """Moves a joint of one arm whose motors nobody else commands; the arm sinks at the end.
+    """Moves a joint of one arm whose motors no one else commands; the arm sinks at the end.
 
     Args:
         axes: The motors of the arm.

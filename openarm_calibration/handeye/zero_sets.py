@@ -151,7 +151,7 @@ def calibrate_zeros(
     plain = config.model_copy(update={"sigma": _AS_DESCRIBED, "by_joint": {}})
     before = _predicted(described, views, optics, plain, None)
     after = _predicted(described, views, optics, fixed, result.solution)
-    joints = dict(zip(result.names, zip(result.values, result.sigma, result.told, strict=True), strict=True))
+    joints = dict(zip(result.names, zip(result.values, result.sigma, result.observable, strict=True), strict=True))
     joints = {name: row for name, row in joints.items() if name in described.joints}
     offsets = {name: float(value) if result.off else 0.0 for name, (value, _, _) in joints.items()}
     places = list(dict.fromkeys((samples.head.camera, samples.head.parent) for samples in sessions))
@@ -159,7 +159,7 @@ def calibrate_zeros(
         of=sessions[0].head.zeros_of,
         offsets=offsets,
         sigma={name: float(sigma) for name, (_, sigma, _) in joints.items()},
-        by_prior=tuple(name for name, (_, _, told) in joints.items() if not told),
+        by_prior=tuple(name for name, (_, _, observable) in joints.items() if not observable),
         cameras=tuple(camera for camera, _ in places),
         samples=int(np.count_nonzero(result.solution.used)),
         sessions=tuple(hashes),
@@ -185,8 +185,10 @@ def _doubts(
             f"with the zeros left-out poses are predicted no better ({after.px:.2f} px, {after.metres * 1e3:.2f} mm)"
             f" than without ({before.px:.2f} px, {before.metres * 1e3:.2f} mm); take more samples, of all joints"
         )
-    for name, value, prior, told in zip(result.names, result.values, result.prior, result.told, strict=True):
-        if told and abs(value) > max(_LIKELY, 4.0 * prior):
+    for name, value, prior, observable in zip(
+        result.names, result.values, result.prior, result.observable, strict=True
+    ):
+        if observable and abs(value) > max(_LIKELY, 4.0 * prior):
             failures.append(
                 f"{name} seems off by {math.degrees(value):.1f}°, which no zero is: check order and signs of the"
                 " joints, and the robot (--robot)"

@@ -109,7 +109,7 @@ class ZerosResult:
         return bool(self.prior.max(initial=0.0) > _SCALES[0])
 
     @property
-    def told(self) -> tuple[bool, ...]:
+    def observable(self) -> tuple[bool, ...]:
         """Whether the data tell each parameter; where not, the prior decides."""
         return tuple(bool(s < _TOLD * p) for s, p in zip(self.sigma, self.prior, strict=True))
 
@@ -122,8 +122,8 @@ class ZerosResult:
         if not self.off:
             return ("the samples show no joint whose zero is off",)
         out: list[str] = []
-        for name, value, sigma, prior, told in zip(
-            self.names, self.values, self.sigma, self.prior, self.told, strict=True
+        for name, value, sigma, prior, observable in zip(
+            self.names, self.values, self.sigma, self.prior, self.observable, strict=True
         ):
             if name.endswith(" length"):
                 figure = f"{value * 1e3:+.2f} ± {sigma * 1e3:.2f} mm"
@@ -133,7 +133,7 @@ class ZerosResult:
                 figure = f"{math.degrees(value):+.2f} ± {math.degrees(sigma):.2f}°"
             if prior == 0.0:
                 out.append(f"{name}: taken for true")
-            elif told:
+            elif observable:
                 out.append(f"{name}: {figure}")
             else:
                 out.append(f"{name}: {figure}; no view tells it from a mount or another joint: the prior decides")

@@ -52,13 +52,13 @@ def test_zeros_of_both_arms_are_found_to_0_05_degrees_and_what_a_mount_takes_up_
         made = trial(ROBOT, np.random.default_rng([1, seed]), count=12)
         found = solved(ROBOT, made)
         away = dict(zip(found.names, found.values - [made.zeros[name] for name in found.names], strict=True))
-        told = dict(zip(found.names, found.told, strict=True))
+        observable = dict(zip(found.names, found.observable, strict=True))
         for arm in ("right", "left"):
             for joint in range(1, 8):
                 name = f"openarm_{arm}_joint{joint}"
-                assert told[name] == (1 < joint < 7), name
+                assert observable[name] == (1 < joint < 7), name
                 assert joint in (1, 7) or abs(away[name]) < math.radians(0.1), name
-        seen = [error for name, error in away.items() if told[name]]
+        seen = [error for name, error in away.items() if observable[name]]
         assert np.sqrt(np.mean(np.square(seen))) < math.radians(0.05)
         nees += list(groups(found, made).values())
         decided = [line for line in found.sentences() if "the prior decides" in line]
