@@ -289,7 +289,7 @@ class Arm(PlanningGroup):
         if requested == 0.0:
             return self.config.limits.default_scale
         if not _SLOWEST <= requested <= 1.0:
-            text = f"velocity_scale is {requested:g}, expected {_SLOWEST:g} to 1 (or 0 for the default)"
+            text = f"velocity_scale is {requested}, expected {_SLOWEST:g} to 1 (or 0 for the default)"
             raise OpenArmError(Code.INVALID_ARGUMENT, text)
         return requested
 

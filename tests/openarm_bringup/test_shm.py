@@ -16,12 +16,12 @@ import pytest
 from openarm_bringup.supervision.environment import node_arguments, node_environment, of_one_type, write_profile
 from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_bringup.supervision.shm import (
-    SHM,
     mapped_by,
     names_of,
     shm_need_mib,
     sweep,
     unborn,
+    unused,
     with_larger_segments,
     without_reader,
 )
@@ -179,7 +179,7 @@ def test_a_process_whose_threads_hang_leaves_with_its_exit_code_and_nothing_of_i
     assert done.returncode == 3, done.stderr
     names = done.stdout.split()
     assert len(names) >= 2
-    assert [name for name in names if (SHM / name).exists()] == []
+    assert unused(names) == []  # Fast DDS shares some ports with participants of other domains
 
 
 @pytest.mark.parametrize(
