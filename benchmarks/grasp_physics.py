@@ -30,6 +30,7 @@ from benchmarks.grasp_trials import (
     LIFT,
     MUJOCO_DEFAULTS,
     OBJECTS,
+    SIDES,
     NoGraspError,
     Trial,
     make,
@@ -60,7 +61,7 @@ def start(kind: str, seed: int, physics: PhysicsConfig | None) -> Trial:
     for redraw in range(50):
         item, error = make(kind, seed + 1000 * redraw)
         try:
-            return Trial(item, ("right", "left")[seed % 2], error, physics)
+            return Trial(item, SIDES[seed % len(SIDES)], error, physics)
         except NoGraspError:
             continue
     raise NoGraspError(f"no grasp of any {kind} of seed {seed}")

@@ -27,6 +27,8 @@ from openarm_sim_bridge.world.model import PhysicsConfig, compile_model
 from openarm_sim_bridge.world.world import start_qpos
 
 ROBOT, WORK = RobotDescription.load(), robot_work()
+#: Arms in turn; objects are drawn before the first.
+SIDES = ROBOT.arm_names[::-1]
 TABLE, MEASURES = WORK.table, next(iter(ROBOT.hands.values())).parts
 OPEN, LIFT, BACK = MEASURES.opening, 0.12, 0.08
 
@@ -139,11 +141,12 @@ def quintic(u: float) -> float:
 
 
 class Trial:
-    """One grasp in a world of its own; an object of the right half stands in the left one for the left arm."""
+    """One grasp in a world of its own; for the second of two arms all is mirrored."""
 
     def __init__(self, item: SceneObject, side: str, error: Array, physics: PhysicsConfig | None = None) -> None:
         flipped = item.model_copy(update={"position": (item.position[0], -item.position[1]), "yaw": -item.yaw})
-        self.item = item if side == "right" else flipped
+        first = side == SIDES[0]
+        self.item = item if first else flipped
         self.side, self.hand = side, ROBOT.hand(side)
         scene = Scene(table=TABLE, objects=(self.item,))
         self.model = compile_model(ROBOT, scene, {}, None, physics)
@@ -161,7 +164,7 @@ class Trial:
             self.start |= ROBOT.group_state(f"{arm}_arm", "home")
         self.start |= dict.fromkeys(self.joints, self.hand.opened)
         self.penetration = self.speed = 0.0
-        self.grasp = self._choose(error if side == "right" else error * (1.0, -1.0, -1.0))
+        self.grasp = self._choose(error if first else error * (1.0, -1.0, -1.0))
         self._place(self.grasp.q(BACK))
 
     def _choose(self, error: Array) -> Grasp:
