@@ -8,6 +8,7 @@ import { OrbitControls } from "./vendor/OrbitControls.js";
 THREE.ColorManagement.enabled = false; // colours are shown as they are given
 const FOVY = 0.7;
 const START = { eye: [1.314, -1.154, 1.259], target: [0.3, 0, 0.42] };
+const WORK = new THREE.Box3(new THREE.Vector3(0.1, -0.35, 0.3), new THREE.Vector3(0.7, 0.35, 0.6)); // shown beside the robot
 const SHAPES = {
   box: new THREE.BoxGeometry(),
   cylinder: new THREE.CylinderGeometry(0.5, 0.5, 1, 28).rotateX(Math.PI / 2),
@@ -151,6 +152,17 @@ export class Scene {
     });
   }
 
+  /** Look at all of a layer and the work space in front of it, from the direction of the start. */
+  frame(layer) {
+    const { center, radius } = new THREE.Box3().setFromObject(this.layers.get(layer)).union(WORK).getBoundingSphere(new THREE.Sphere());
+    const across = Math.min(1, this.camera.aspect) * Math.tan(FOVY / 2);
+    const back = new THREE.Vector3(...START.eye).sub(new THREE.Vector3(...START.target)).normalize();
+    this.controls.target.copy(center);
+    this.camera.position.copy(center).addScaledVector(back, (0.8 * radius) / Math.sin(Math.atan(across)));
+    this.controls.update();
+    this.controls.saveState();
+  }
+
   /** Where a point is on the canvas, CSS pixels; null behind the eye. */
   onScreen(point) {
     const { x, y, z } = new THREE.Vector3(...point).project(this.camera);
@@ -167,7 +179,7 @@ export class Scene {
   }
 
   #steer() {
-    const controls = new OrbitControls(this.camera, this.canvas);
+    const controls = (this.controls = new OrbitControls(this.camera, this.canvas));
     const { ROTATE, PAN } = THREE.MOUSE;
     Object.assign(controls, {
       rotateSpeed: 0.8, zoomSpeed: 2, minDistance: 0.25, maxDistance: 6, minPolarAngle: 0.02, maxPolarAngle: 1.97,
@@ -175,7 +187,6 @@ export class Scene {
     });
     controls.target.set(...START.target);
     controls.update();
-    controls.saveState();
     controls.addEventListener("change", () => this.redraw());
     this.canvas.addEventListener("dblclick", () => controls.reset());
     const keys = {

@@ -20,6 +20,8 @@ let links = new Map(); // of the robot, with what hangs on them
 let held = [];
 let boxes = [];
 let meshes = [];
+let complete = false; // the robot with its meshes
+let framed = false; // once: a graph that starts again leaves the view where it is
 
 const handlers = {
   hello(message) {
@@ -37,6 +39,10 @@ const handlers = {
   },
   robot(_, body) {
     [...links.values()].forEach((link, i) => place(link, new Float32Array(body, 64 * i, 16)).visible = true);
+    if (complete && !framed) {
+      scene.frame("robot");
+      framed = true;
+    }
     scene.redraw();
   },
   held(message) {
@@ -155,6 +161,7 @@ function showRobot(robot) {
   links = new Map(robot.links.map((name) => [name, group()]));
   const all = [...links.values()];
   meshes = robot.shapes.filter(({ kind }) => kind === "mesh");
+  complete = meshes.length === 0;
   for (const { link, kind, size, pose, color } of robot.shapes.filter((shape) => shape.kind !== "mesh")) {
     const [a, b] = [2 * size[0], size[1]];
     all[link].add(solid(kind, pose, { box: size, cylinder: [a, a, b], sphere: [a, a, a] }[kind], color.slice(0, 3)));
@@ -173,6 +180,7 @@ function showMeshes(counts, body) {
   });
   const all = [...links.values()];
   for (const { link, mesh, size, pose, color } of meshes) all[link].add(faceted(files[mesh], pose, size, color.slice(0, 3)));
+  complete = true;
   scene.redraw();
 }
 
