@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from openarm_calibration.handeye.transforms import moved, skews
 from openarm_calibration.handeye.unknowns import Noise
 from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, solve_zeros
 from openarm_common import se3
-from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras, true_mount
+from openarm_common.camera.cameras import T_LINK_OPTICAL, CameraConfig, load_cameras, true_mount
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 
@@ -42,14 +43,14 @@ SETS: tuple[tuple[str, str, Setup], ...] = (
 
 
 def postures(
-    description: RobotDescription, camera: str, arm: str, setup: Setup, count: int, rng: np.random.Generator,
-    zeros: dict[str, float], noise: Noise, mount_seed: int,
+    description: RobotDescription, spec: CameraConfig, arm: str, setup: Setup, count: int, rng: np.random.Generator,
+    zeros: Mapping[str, float], noise: Noise, mount_seed: int,
 ) -> tuple[list[ArmView], Array, Array]:  # fmt: skip
     """Return views of a set, without numbers of camera and board, and the true X and Z.
 
     Args:
-        description: The robot.
-        camera: Its name.
+        description: Any robot.
+        spec: Its camera.
         arm: That moves.
         setup: in_hand or to_hand.
         count: Views.
@@ -58,10 +59,9 @@ def postures(
         noise: Standard deviations.
         mount_seed: Of the true mount of the camera.
     """
-    spec = load_cameras()[camera]
     k = spec.intrinsics
     row, size = np.array([k.fx, k.fy, k.cx, k.cy]), (k.width, k.height)
-    tip = spec.parent if setup == "in_hand" else f"openarm_{arm}_link7"
+    tip = spec.parent if setup == "in_hand" else description.arm(arm).flange
     base = description.root if setup == "in_hand" else spec.parent
     names = list(description.arm_joints(arm))
     home = description.group_state(f"{arm}_arm", "home")
@@ -88,7 +88,7 @@ def postures(
         if not ((pixels > 8.0) & (pixels < np.array(size) - 8.0)).all():
             continue
         pixels = pixels + rng.normal(0.0, noise.px, pixels.shape)
-        view = View(BOARD.points, pixels, A, setup, BOARD.radius, name=f"{camera}_{arm}_{len(out):02d}")
+        view = View(BOARD.points, pixels, A, setup, BOARD.radius, name=f"{spec.name}_{arm}_{len(out):02d}")
         out.append(ArmView(view, base, tip, dict(zip(names, q.tolist(), strict=True)), T))
     return out, X, Z
 
@@ -117,13 +117,13 @@ def trial(
         noise: Standard deviations.
     """
     zeros = {name: float(rng.normal(0.0, off)) for arm in ("right", "left") for name in description.arm_joints(arm)}
-    seed = int(rng.integers(1, 1000))
+    seed, known = int(rng.integers(1, 1000)), load_cameras()
     cameras = tuple(dict.fromkeys(camera for camera, _, _ in SETS))
     X: dict[str, Array] = {}
     views: list[ArmView] = []
     Z: list[Array] = []
     for board, (camera, arm, setup) in enumerate(SETS):
-        own, X[camera], place = postures(description, camera, arm, setup, count, rng, zeros, noise, seed)
+        own, X[camera], place = postures(description, known[camera], arm, setup, count, rng, zeros, noise, seed)
         Z.append(place)
         for k, taken in enumerate(own, len(views)):
             numbered = replace(taken.view, camera=cameras.index(camera), board=board, pose=k)

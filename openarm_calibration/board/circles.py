@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ Pixels = NDArray[np.uint8]
 _SAMPLES = 8
 
 
-class _Circles(Config):
+class _Circles(Config, ABC):
     """Black circles on white; what all circle grids have in common."""
 
     columns: int
@@ -28,9 +29,9 @@ class _Circles(Config):
     border: float
 
     @property
+    @abstractmethod
     def points(self) -> Array:
         """(n, 3) circle centres, row by row."""
-        raise NotImplementedError
 
     @property
     def feature(self) -> float:

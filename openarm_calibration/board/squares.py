@@ -6,6 +6,7 @@ All are drawn from the same list of black boxes, as picture and as vectors.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import cached_property
 from typing import Literal
 
@@ -37,25 +38,25 @@ def known_dictionary(name: str) -> str:
     raise ValueError(f"unknown dictionary; dictionaries: {', '.join(DICTIONARIES)}")
 
 
-class _Boxes(Config):
+class _Boxes(Config, ABC):
     """Black axis-aligned boxes on white; what these boards have in common."""
 
     border: float
 
     @property
+    @abstractmethod
     def feature(self) -> float:
         """Edge of what must be large enough in an image, m."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def pattern(self) -> tuple[float, float]:
         """Width and height without the border, m."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def boxes(self) -> Array:
         """(n, 4) left, top, right and bottom of the black boxes, which do not overlap, m from the middle."""
-        raise NotImplementedError
 
     @property
     def radius(self) -> float:

@@ -4,7 +4,8 @@
 Each cause is a model of its own: one more unknown with a wide prior (size of the board, focal length, principal point,
 distortion, delay), another board, or poses without a mistake (see `variants`). Compared is minus twice the logarithm of
 the marginal likelihood of the same pixels, all unknowns and the spreads of robot and misfit fitted: its drop is twice
-the logarithm of a Bayes factor (Kass and Raftery 1995, "Bayes factors", call 10 very strong). m, rad, px.
+the logarithm of a Bayes factor (Kass and Raftery 1995, "Bayes factors", call 10 very strong). Where joints are known,
+their zeros may be off in either model, so that a cause must say more than they do. m, rad, px.
 """
 
 from __future__ import annotations
@@ -19,17 +20,18 @@ from scipy.optimize import minimize_scalar
 
 from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.marks import fit_poses
+from openarm_calibration.handeye.nuisance import fit, with_zeros
 from openarm_calibration.handeye.problem import Extra, Problem, chain
-from openarm_calibration.handeye.refine import mount_error, pixel_noise, refine
-from openarm_calibration.handeye.unknowns import FREE, Estimate, Noise, Priors
+from openarm_calibration.handeye.refine import mount_error, pixel_noise
+from openarm_calibration.handeye.unknowns import Estimate, Noise, Priors
 from openarm_calibration.handeye.variants import variants
 from openarm_common.errors import OpenArmError
 from openarm_common.types import Array
 
 #: Drop of minus twice the log likelihood from which a cause is evident.
 EVIDENT = 10.0
-#: Such a poor answer is looked at for mistakes in its poses, m and rad of the robot from pose to pose.
-_POOR = (3e-3, math.radians(0.3))
+#: Such a poor answer is looked at for mistakes in its poses: m and rad of the robot from pose to pose, px of a misfit.
+_POOR = (3e-3, math.radians(0.3), 3.0)
 #: What no arm in order exceeds: a variant of the poses that is as bad as that explains nothing.
 _HOPELESS = (0.03, math.radians(3.0))
 #: Marks farther from any flat board than this are on another one, px.
@@ -109,28 +111,27 @@ class Freed:
 def freed(problem: Problem, X: Array, Z: Array, noise: Noise) -> tuple[Estimate, dict[str, Freed]]:
     """Return the answer for input that is right, and those with one more unknown by name.
 
+    In all of them the zeros of the joints are off where that is likelier.
+
     Args:
         problem: Views that the answer rests on.
         X: (cameras, 4, 4) to start from.
         Z: (boards, 4, 4) to start from.
         noise: To start from.
     """
-    base = _fit(problem, X, Z, noise, (), FREE)
+    base = with_zeros(problem, fit(problem, X, Z, noise))
     out: dict[str, Freed] = {}
     for name, extra, priors in _FREED:
         if extra == "delay" and not np.abs(problem.rate).max() > 1e-4:
             continue
         try:
-            found = _fit(problem, X, Z, noise, (extra,), priors)
+            found = fit(problem, X, Z, noise, (extra,), priors)
         except (OpenArmError, np.linalg.LinAlgError):
             continue
+        if "zeros" in base.extras:
+            found = with_zeros(problem, found, priors)
         out[name] = Freed(name, found, base.evidence - found.evidence)
     return base, out
-
-
-def _fit(problem: Problem, X: Array, Z: Array, noise: Noise, extras: tuple[Extra, ...], priors: Priors) -> Estimate:
-    start = replace(noise, translation=max(noise.translation, 1e-4), rotation=max(noise.rotation, 1e-4), misfit=0.0)
-    return refine(problem, X, Z, start, extras=extras, priors=priors, estimate_robot=True, estimate_px=True)
 
 
 def diagnose(problem: Problem, base: Estimate | None, alternatives: dict[str, Freed]) -> tuple[Cause, ...]:
@@ -142,7 +143,7 @@ def diagnose(problem: Problem, base: Estimate | None, alternatives: dict[str, Fr
         alternatives: The answers with one more unknown.
     """
     out = [_described(problem, base, found) for found in alternatives.values() if base is not None]
-    poor = base is None or base.noise.translation > _POOR[0] or base.noise.rotation > _POOR[1]
+    poor = base is None or _poor(base.noise, float(np.mean(problem.marks)))
     px = pixel_noise(problem)
     best_px = min([px, *(found.estimate.noise.px for found in alternatives.values())])
     if (poor or px > 0.3) and (board := _other_board(problem, base, best_px)) is not None:
@@ -151,6 +152,13 @@ def diagnose(problem: Problem, base: Estimate | None, alternatives: dict[str, Fr
         out += _mistakes(problem, base)
     evident = [cause for cause in out if cause.evidence > EVIDENT]
     return tuple(sorted(evident, key=lambda cause: (-cause.evidence, cause.score)))
+
+
+def _poor(noise: Noise, marks: float) -> bool:
+    return any(
+        spread > limit
+        for spread, limit in zip((noise.translation, noise.rotation, noise.misfit_px(marks)), _POOR, strict=True)
+    )
 
 
 def _described(problem: Problem, base: Estimate, found: Freed) -> Cause:
@@ -198,9 +206,11 @@ def _other_board(problem: Problem, base: Estimate | None, best_px: float) -> Cau
     if base is None:
         return Cause("wrong board", text, math.inf, math.inf, math.inf)
     try:
-        found = _fit(longer, base.X, base.Z, Noise(px, 1e-4, 1e-4), (), FREE)
+        found = fit(longer, base.X, base.Z, Noise(px, 1e-4, 1e-4))
     except (OpenArmError, np.linalg.LinAlgError):
         return None
+    if "zeros" in base.extras:
+        found = with_zeros(longer, found)
     # the logarithm of a number that is known to one part in as many as there are marks
     unknown = math.log(2.0 * float(problem.marks.sum()))
     evidence = base.evidence - found.evidence - unknown
@@ -258,7 +268,7 @@ def _mistakes(problem: Problem, base: Estimate | None) -> Iterator[Cause]:
             continue
         done.add(number)
         try:
-            found = _fit(part, X, Z, Noise(pixel_noise(part), 1e-3, 1e-3), (), FREE)
+            found = fit(part, X, Z, Noise(pixel_noise(part), 1e-3, 1e-3))
         except (OpenArmError, np.linalg.LinAlgError):
             continue
         if found.noise.translation > _HOPELESS[0] or found.noise.rotation > _HOPELESS[1]:

@@ -138,14 +138,19 @@ def evidence(problem: Problem, linear: Linear, noise: Noise, extras: Sequence[Ex
         priors: Of these; a constant is missing where one is infinite.
     """
     value = criterion(*linear.weighed(noise), max(noise.translation, FLOOR), max(noise.rotation, FLOOR))
-    own = 2.0 * math.log(noise.px) * float(np.sum(2 * problem.marks - 6))
     sigma, _ = priors.of(problem, extras)
-    return (
-        value
-        + own
-        + 12.0 * len(problem) * math.log(noise.view_px)
-        + 2.0 * float(np.log(sigma[np.isfinite(sigma)]).sum())
-    )
+    return value + mark_evidence(problem, noise) + 2.0 * float(np.log(sigma[np.isfinite(sigma)]).sum())
+
+
+def mark_evidence(problem: Problem, noise: Noise) -> float:
+    """Return the part of minus twice the log likelihood that the spread of the marks has in it.
+
+    Args:
+        problem: The views.
+        noise: Standard deviations.
+    """
+    own = 2.0 * math.log(noise.px) * float(np.sum(2 * problem.marks - 6))
+    return own + 12.0 * len(problem) * math.log(noise.view_px)
 
 
 def refine(

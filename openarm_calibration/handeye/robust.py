@@ -3,7 +3,8 @@
 
 The order: refuse motions that determine nothing; a quick closed form; the refinement; a test of each robot pose
 against what the others predict for it. Where a pose fails, or the start is spoiled, small random subsets vote for a
-clean one, and poses are taken out and let in again until the set does not change.
+clean one, and poses are taken out and let in again until the set does not change. Several wrong poses of a few hide in
+the spread that they make; where that is large, they are left out if two kinds of poses are likelier than one.
 
 One linear step takes a pose out: with `h` its share of the information and `g` its share of the right-hand side, the
 answer without it moves by `-(H - h)⁻¹ g`. The prediction for the pose then has the spread of its own noise plus that
@@ -13,6 +14,7 @@ of the answer without it. m, rad, px.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
@@ -21,8 +23,19 @@ from scipy import stats
 from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.observability import FEWEST, condition_number, require_accuracy, require_motion
 from openarm_calibration.handeye.problem import Extra, Problem, chain, design
-from openarm_calibration.handeye.refine import pixel_noise, refine
-from openarm_calibration.handeye.unknowns import FREE, Estimate, Noise, Outlier, PoseTest, Priors, Solution, at_zeros
+from openarm_calibration.handeye.refine import linearise, mark_evidence, pixel_noise, refine
+from openarm_calibration.handeye.spread import criterion, search
+from openarm_calibration.handeye.unknowns import (
+    FREE,
+    Estimate,
+    Noise,
+    Outlier,
+    PoseTest,
+    Priors,
+    Solution,
+    State,
+    at_zeros,
+)
 from openarm_common import se3
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
@@ -100,6 +113,12 @@ def _twist(T_from: Array, T_to: Array) -> Array:
     return np.concatenate([T_to[:3, 3] - T_from[:3, 3] - np.cross(w, half), w])
 
 
+#: A robot with such a spread from pose to pose may hide wrong poses, m and rad.
+GOOD_ARM = (1e-3, math.radians(0.1))
+#: Spread of wrong poses to start from, m and rad.
+_LOOSE = (0.02, 0.05)
+#: Drop of minus twice the log likelihood from which there are wrong poses.
+_EVIDENT = 10.0
 #: With fewer poses it can't be determined which one is wrong; a clean set would lose poses by chance.
 _FEWEST_TO_REJECT = 7
 
@@ -193,8 +212,11 @@ def _robust(
     if not config.reject_outliers or _poses(problem, used) < _FEWEST_TO_REJECT:
         return used, estimate, tests
     suspect = any(tests[p].distance > limit for p in problem.pose[usable]) or _spoiled(problem, used, estimate)
-    if not suspect:
+    noise = estimate.noise
+    hidden = estimate.spread is not None and (noise.translation > GOOD_ARM[0] or noise.rotation > GOOD_ARM[1])
+    if not suspect and not hidden:
         return used, estimate, tests
+    whole = used, estimate, tests
     used = _consensus(at_zeros(problem, estimate), usable, config)
     start = None
     seen: set[bytes] = set()
@@ -207,7 +229,36 @@ def _robust(
             break
         seen.add(wanted.tobytes())
         used, start = wanted, estimate
+    if not suspect and not _two_kinds(problem, usable & ~used, estimate) < whole[1].evidence - _EVIDENT:
+        return whole
     return used, estimate, tests
+
+
+def _two_kinds(problem: Problem, out: Mask, estimate: Estimate) -> float:
+    """Return minus twice the log marginal likelihood of all views when some poses have a spread of their own.
+
+    Comparable to the evidence of an answer that all poses have a part in; any share of them is as likely.
+
+    Args:
+        problem: All views.
+        out: (n,) views that the answer does not rest on.
+        estimate: The answer by the others.
+    """
+    if not out.any():
+        return math.inf
+    part = at_zeros(problem, estimate).subset(out)
+    state, noise = State.start(part, estimate.X, estimate.Z), estimate.noise
+    state = replace(state, intrinsics=estimate.intrinsics, scale=estimate.scale, distortion=estimate.distortion)
+    for _ in range(5):
+        full, KMK, both = linearise(part, state, ()).weighed(noise)
+        given = np.ascontiguousarray(full[-1:, -1:]), KMK, np.ascontiguousarray(both[:, :, -1:])
+        translation, rotation = search(*given, *_LOOSE, True)
+        value = criterion(*given, translation, rotation)
+        prior = replace(noise, translation=translation, rotation=rotation).prior
+        state = replace(state, correction=np.linalg.solve(KMK + prior, given[2])[:, :, 0])
+    poses, wrong = int(problem.pose.max()) + 1, len(np.unique(part.pose))
+    ways = 2.0 * math.log((poses + 1) * math.comb(poses, wrong))
+    return estimate.evidence + value + mark_evidence(part, noise) + ways
 
 
 def _refine(

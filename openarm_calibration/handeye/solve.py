@@ -3,20 +3,17 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from openarm_calibration.handeye.causes import diagnose, freed
 from openarm_calibration.handeye.observability import FEWEST, require_motion
 from openarm_calibration.handeye.problem import Problem
 from openarm_calibration.handeye.refine import pixel_noise, refine
-from openarm_calibration.handeye.robust import SolveConfig, solve_robustly, starting_mounts
+from openarm_calibration.handeye.robust import GOOD_ARM, SolveConfig, solve_robustly, starting_mounts
 from openarm_calibration.handeye.unknowns import FREE, Noise, Priors, Solution
 from openarm_common.errors import Code, OpenArmError
 
-#: An answer with a smaller spread of the robot's pose and of the marks is not one of wrong input, m, rad and px.
-_GOOD_ARM = (1e-3, math.radians(0.1))
+#: An answer with a smaller spread of the marks, and a good arm, is not one of wrong input, px.
 _GOOD_PX = 1.0
 
 
@@ -55,7 +52,7 @@ def _explained(problem: Problem, error: OpenArmError) -> str:
         X, Z = starting_mounts(problem)
         base = refine(problem, X, Z, noise, estimate_robot=True)
         found = base.noise
-        if found.translation < _GOOD_ARM[0] and found.rotation < _GOOD_ARM[1] and found.view_px < _GOOD_PX:
+        if found.translation < GOOD_ARM[0] and found.rotation < GOOD_ARM[1] and found.view_px < _GOOD_PX:
             return ""  # the views agree with each other: what lacks is more of them
         base, alternatives = freed(problem, base.X, base.Z, base.noise)
     except (OpenArmError, np.linalg.LinAlgError):

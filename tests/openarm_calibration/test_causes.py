@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks import hand_eye_problems as synthetic
 from benchmarks import wrong_input
-from benchmarks.wrong_input import KINDS, NOISE, Tally, judge
+from benchmarks.wrong_input import KINDS, NOISE, Tally, judge, synthetic_set
 from openarm_calibration.handeye.left_out import held_out, rival
 from openarm_calibration.handeye.marks import normal_equations, project
 from openarm_calibration.handeye.problem import assemble
@@ -33,7 +33,8 @@ def test_wrong_input_is_named_and_never_silent(kind: wrong_input.Spoil) -> None:
     """Two sets of each kind (the benchmark has a hundred), and sets without a mistake."""
     tally = Tally()
     for k in range(2):
-        judge(kind, 15, np.random.default_rng([31, k]), tally)
+        rng = np.random.default_rng([31, k])
+        judge(kind, synthetic_set(15, rng), rng, tally)
     assert tally.silent == 0
     assert tally.named == 2, (tally.grades, tally.said)
 
