@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from openarm_bringup.supervision import runs
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
-from openarm_common.camera.cameras import uncertain_cameras
+from openarm_common.camera.cameras import load_cameras, uncertain_cameras
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.boards import CALIBRATION
+from openarm_common.scene.boards import CALIBRATION, board_start
 
 if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
@@ -120,12 +119,11 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
         from openarm_bringup.ros.simulation import reset_world
         from openarm_calibration.ros.client import CalibrationClient
 
-        # fingers that are open hide less from a camera behind them
-        opened = {hand.joint: hand.opened for hand in RobotDescription.load().hands.values()}
+        known = load_cameras()
         with CalibrationClient() as client:
             for camera in cameras:
                 listeners.on_camera(camera)
-                reset_world(client, scene_of(camera), joints=opened)
+                reset_world(client, scene_of(camera), joints=board_start(known[camera]))
                 session = str((run.run_dir / f"{camera}.npz").absolute())
                 run.results[camera] = client.auto(
                     camera, **options.goal, session=session, on_feedback=listeners.on_feedback, stop=stop

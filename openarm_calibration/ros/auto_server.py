@@ -204,7 +204,7 @@ class _Run:
                     raise
 
     def _miss(self, q: Array, error: OpenArmError) -> None:
-        self._search.refuse(q)
+        self._search.refuse(q, reached=True)
         posture = ", ".join(f"{position:.2f}" for position in q)
         self._result.missed.append(f"({posture}): {error.message}")
         self._node.get_logger().info(f"no sample at ({posture}): {error.message}")

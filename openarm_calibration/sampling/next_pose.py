@@ -94,8 +94,8 @@ _BATCH = 250
 _AS_GOOD = 1.1
 #: Postures that are enough for the first pose; finding them takes long.
 _ENOUGH = 24
-#: Postures that differ less count as the same, rad.
-_NEIGHBOUR = 0.08
+#: Postures that differ less from one that can't be reached, or did not show the board, count as the same, rad.
+_NEIGHBOUR, _ALIKE = 0.08, 0.25
 
 
 class SearchConfig(Config):
@@ -158,6 +158,7 @@ class PoseSearch:
         self._bodies = Bodies(description)
         self._known: list[Array] = []
         self._refused: list[Array] = []
+        self._widths: list[float] = []
 
     def learn(self, samples: SampleSet) -> Belief:
         """Update what is known after a sample was taken.
@@ -185,9 +186,15 @@ class PoseSearch:
         self.belief = Belief(X, Z, *solution.sigma()) if credible else before
         return self.belief
 
-    def refuse(self, q: Array) -> None:
-        """Do not propose a posture (n,) again that can't be reached or did not show the board, nor its neighbours."""
+    def refuse(self, q: Array, *, reached: bool = False) -> None:
+        """Do not propose a posture (n,) again that can't be reached or did not show the board, nor its neighbours.
+
+        Args:
+            q: (n,) rad.
+            reached: The arm was there, and the board was not seen.
+        """
         self._refused.append(q)
+        self._widths.append(_ALIKE if reached else _NEIGHBOUR)
 
     def propose(self, samples: SampleSet, state: Mapping[str, float], most: int = 12) -> list[Array]:
         """Return the next postures (n,) in the order of `SampleSet.joint_names`, best first.
@@ -240,7 +247,7 @@ class PoseSearch:
             k = samples.joint_names.index(lift.joint)
             low[k] = high[k] = state[lift.joint]
         margin = config.margin if self.belief.solved else _RULER
-        pool, refused = list(self._known), np.array(self._refused)
+        pool, refused, widths = list(self._known), np.array(self._refused), np.array(self._widths)
         wanted = config.candidates if pool else _ENOUGH
         width, height = (edge / 2.0 for edge in samples.board.size)
         corners = np.array([[x, y, 0.0] for x in (-width, width) for y in (-height, height)])
@@ -257,7 +264,8 @@ class PoseSearch:
             else:
                 drawn = rng.uniform(low, high, (_BATCH, len(low)))
             if len(refused):
-                drawn = drawn[np.abs(drawn[:, None] - refused).max(axis=2).min(axis=1) > _NEIGHBOUR]
+                away = np.abs(drawn[:, None] - refused).max(axis=2) / widths
+                drawn = drawn[away.min(axis=1) > 1.0]
             views = self._views(samples, drawn, Z)
             for k in np.flatnonzero(self._centred(samples, views)):
                 q, T = drawn[k], views[k]

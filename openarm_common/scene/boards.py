@@ -6,13 +6,16 @@ For a fixed camera the last arm holds it ahead of its fingers; for one that move
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, load_cameras, near_camera, table_camera, uncertain_cameras
-from openarm_common.robot.description import RobotDescription
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import Primitive, RobotDescription
 from openarm_common.robot.folder import robot_work
 from openarm_common.types import Array
 
@@ -24,6 +27,10 @@ _AHEAD, _HELD = 0.19, se3.rotation_from_z_y((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 #: And on the table: before the far end of the region, to the side of the arm, m.
 _BEFORE, _ASIDE, _ABOVE = 0.03, 0.2, 0.005
 _LYING = ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))
+#: Edges of what carries the marks, as in the model, m.
+_PLATE = (0.18, 0.24, 0.003)
+#: The board in a posture to begin in keeps this from all else, m; postures tried, the last ones so far from home, rad.
+_ROOM, _TRIES, _AWAY = 0.015, 4000, 1.5
 #: An arm whose shoulder is nearer to the middle is of neither side, m.
 _MIDDLE = 0.02
 
@@ -53,6 +60,49 @@ def board_of(camera: CameraConfig, description: RobotDescription) -> tuple[str, 
     y = float(np.sign(shoulder)) * _ASIDE if abs(shoulder) > _MIDDLE else 0.0
     place = (round(work.region.x[1] - _BEFORE, 3), y, round(work.table.top_z + _ABOVE, 3))
     return "", se3.make(se3.rotation_from_z_y(*_LYING), place)
+
+
+def board_start(camera: CameraConfig) -> dict[str, float]:
+    """Return where the joints are when a calibration begins, rad or m: hands open, and the board clear of everything.
+
+    The arm that holds the board is at home, or as near to it as a posture is found; open fingers hide less.
+
+    Raises:
+        OpenArmError: NO_PLAN, when no posture near home is clear.
+    """
+    description = RobotDescription.load()
+    start = {hand.joint: hand.opened for hand in description.hands.values()}
+    link, T_link_board = board_of(camera, description)
+    if not link:
+        return start
+    from openarm_common.collision.self_collision import SelfCollision
+
+    lift = description.lift
+    whole = start | ({} if lift is None else {lift.joint: lift.home})
+    for arm in description.arm_names:
+        whole |= description.group_state(f"{arm}_arm", "home")
+    table = robot_work().table
+    low, high = np.array([table.x[0], table.y[0], table.top_z - table.thickness]), [table.x[1], table.y[1], table.top_z]
+    top = Primitive("table", "box", tuple(np.subtract(high, low).tolist()), se3.make(None, np.add(low, high) / 2.0))
+    roomy = tuple(edge + 2.0 * _ROOM for edge in _PLATE)
+    board = Primitive("board", "box", roomy, T_link_board @ se3.make(None, (0.0, 0.0, _PLATE[2] / 2.0)))
+    links = dict(description.links)
+    for carrier, shape in ((link, board), (description.root, top)):
+        links[carrier] = replace(links[carrier], collision=(*links[carrier].collision, shape))
+    robot = SelfCollision(replace(description, links=MappingProxyType(links)), tuple(whole))
+    moved = description.arm_joints(description.arm_of(link))
+    home, (lower, upper) = np.array([whole[name] for name in moved]), description.limits(moved)
+    rng = np.random.default_rng(0)
+    for away in np.linspace(0.0, _AWAY, _TRIES):
+        q = np.clip(home + rng.uniform(-away, away, len(home)), lower, upper)
+        there = whole | dict(zip(moved, q.tolist(), strict=True))
+        if robot.nearest(robot.distances(np.array([*there.values()]))).distance > 0.0:
+            return start | ({} if away == 0.0 else {name: there[name] for name in moved})
+    raise OpenArmError(
+        Code.NO_PLAN,
+        f"of {_TRIES} postures near home none keeps the board on {link!r} {_ROOM * 1e3:.0f} mm from robot and table;"
+        " calibrate with another board or carrier (calibration.carrier), from a posture of your own (--running)",
+    )
 
 
 def board_scene(camera: CameraConfig) -> dict[str, Any]:

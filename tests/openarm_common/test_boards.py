@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.camera.cameras import uncertain_cameras
-from openarm_common.robot.folder import ROBOT, robot_names
-from openarm_common.scene.boards import board_scenes
+from openarm_common.camera.cameras import load_cameras, uncertain_cameras
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import ROBOT, robot_names, robot_work
+from openarm_common.scene.boards import board_of, board_scenes, board_start
 from openarm_common.scene.scene import load_scene
 
 
@@ -37,3 +38,29 @@ def test_each_camera_whose_mount_is_not_known_has_a_scene(robot, monkeypatch):
     for name in board_scenes():
         assert load_scene(name).objects == ()
         assert len(load_scene(name).fixtures) == 1
+
+
+@pytest.mark.parametrize("robot", robot_names())
+@pytest.mark.requirement("A-33", "R-06")
+def test_a_calibration_begins_with_the_board_above_the_table_and_in_no_wall(robot, monkeypatch):
+    """Home where that will do; in the Cell home would put the board into its side wall."""
+    monkeypatch.setenv(ROBOT, robot)
+    description = RobotDescription.load()
+    for name in uncertain_cameras():
+        camera = load_cameras()[name]
+        link, T_link_board = board_of(camera, description)
+        start = board_start(camera)
+        arms = {joint for arm in description.arm_names for joint in description.arm_joints(arm)}
+        assert not (arms & start.keys() and robot in ("openarm_v1", "openarm_v2", "panda"))
+        if not link:
+            continue
+        whole = dict.fromkeys(description.joints, 0.0)
+        for arm in description.arm_names:
+            whole |= description.group_state(f"{arm}_arm", "home")
+        corners = np.array([(x, y, 0.0) for x in (-0.09, 0.09) for y in (-0.12, 0.12)])
+        placed = se3.apply(description.link_pose(link, whole | start) @ T_link_board, corners)
+        work = robot_work()
+        above = placed[placed[:, 0] > work.table.x[0]]
+        assert (above[:, 2] > work.table.top_z + 0.01).all()
+        if description.lift is not None:
+            assert np.abs(placed[:, 1]).max() < work.table.y[1] - 0.01
