@@ -84,7 +84,18 @@ class SelfCollision:
 
     def distances(self, q: Array) -> Array:
         """Return the distances (p,) of the pairs of shapes that must not touch, at most `_FAR`, in a posture (n,)."""
-        return self._distances(self._share @ q + self._offset, self._pairs)
+        return self.distances_of(q, self._pairs)
+
+    def distances_of(self, q: Array, pairs: Ints) -> Array:
+        """Return the same of some of `pairs_of_links`, (k, 2)."""
+        return self._distances(self._share @ q + self._offset, pairs)
+
+    def pairs_of_links(self) -> dict[tuple[str, str], Ints]:
+        """Return the pairs of shapes (k, 2) that must not touch, by the links that they belong to."""
+        found = dict[tuple[str, str], list[Ints]]()
+        for pair in self._pairs:
+            found.setdefault((self._links[pair[0]], self._links[pair[1]]), []).append(pair)
+        return {links: np.array(pairs) for links, pairs in found.items()}
 
     def nearest(self, distances: Array) -> Nearest:
         """Return the nearest pair of `distances`."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import coal
 import numpy as np
@@ -36,13 +37,19 @@ class CollisionRobot:
     Args:
         description: The robot.
         kinematics: The arm that moves.
+        apart: Least distances, m, of links that the design holds apart (`held_apart`): no more is asked of them.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the arm has no collision shapes, or some that are not primitives.
     """
 
-    def __init__(self, description: RobotDescription, kinematics: ArmKinematics) -> None:
-        self.kinematics = kinematics
+    def __init__(
+        self,
+        description: RobotDescription,
+        kinematics: ArmKinematics,
+        apart: Mapping[frozenset[str], float] = MappingProxyType({}),
+    ) -> None:
+        self.kinematics, self.apart = kinematics, apart
         self.arm = ArmLinks.of(description, kinematics)
         self.model = pin.buildModelFromXML(description.urdf, True)
         self.geometry = pin.GeometryModel()

@@ -6,15 +6,17 @@ Everything that is planned goes through here; it holds no state between requests
 
 from __future__ import annotations
 
+import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from openarm_common.collision.held_apart import held_apart
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
@@ -35,6 +37,7 @@ from openarm_motion.timing.blending import PolylineTiming
 from openarm_motion.timing.trajectory import JointLimits, Trajectory, time_path
 from openarm_motion.timing.validation import keeps_clear, validate_trajectory
 
+_LOG = logging.getLogger(__name__)
 #: A joint this far outside its limits is a wrong reading, not sag; rad.
 _SAG = 0.05
 
@@ -209,6 +212,7 @@ class Arm(PlanningGroup):
         config: Parameters.
         static: Boxes that are always there (the table), base frame; held objects may rest on them.
         planner: Finds free paths.
+        apart: See `CollisionRobot`; None: it is found here, in some 0.3 s.
 
     Raises:
         OpenArmError: CONFIG_INVALID, when the limits are not for this arm's number of joints.
@@ -221,6 +225,7 @@ class Arm(PlanningGroup):
         config: MotionConfig,
         static: Sequence[Box] = (),
         planner: Planner | None = None,
+        apart: Mapping[frozenset[str], float] | None = None,
     ) -> None:
         self.name, self.title = name, f"the {name} arm"
         self.config = config
@@ -231,7 +236,7 @@ class Arm(PlanningGroup):
         self.kinematics = ArmKinematics(description, config.tool_link.format(arm=name) or description.tcp_link(name))
         self.names, self.lower, self.upper = self.kinematics.names, self.kinematics.lower, self.kinematics.upper
         self.inverse = InverseKinematics(self.kinematics, config.planning.swivels)
-        self.robot = CollisionRobot(description, self.kinematics)
+        self.robot = CollisionRobot(description, self.kinematics, kept(description, config) if apart is None else apart)
         self.static: tuple[Box, ...] = tuple(static)
         self._planner: Planner = planner or make_planner(config.planning.planner)
         self.direct = planner is None and config.planning.planner == "fast"  # another one is asked for every path
@@ -389,6 +394,17 @@ class Arm(PlanningGroup):
         """Timed straight line."""
         speed = self.config.limits.straight_speed * self.scale(scale)
         return time_path(self.names, line.q, line.s, self.limits(scale), speed, self.config.planning.period)
+
+
+@lru_cache(maxsize=4)
+def kept(description: RobotDescription, config: MotionConfig) -> Mapping[frozenset[str], float]:
+    """Links that the design of a robot holds nearer to each other than the clearance asks, with their distance, m."""
+    asked = max(config.clearance.own, config.straight.own)
+    found = held_apart(description, asked)
+    for links, distance in found.items():
+        text = "%s are %.1f mm apart by design: clearance.own, %.1f mm, is not asked of them"
+        _LOG.info(text, " and ".join(sorted(links)), distance * 1e3, asked * 1e3)
+    return found
 
 
 def segment_time(a: Array, b: Array, limits: JointLimits) -> float:

@@ -100,7 +100,7 @@ class LiftedArms(Mapping[str, Arm]):
     @cached_property
     def motion(self) -> LiftMotion:
         """Plans motions of the lift."""
-        return LiftMotion(self.description, self.lift, {name: arm.kinematics.tool_link for name, arm in self.items()})
+        return LiftMotion(self.description, self.lift, self)
 
     def __getitem__(self, name: str) -> Arm:
         return self._arms[name]
@@ -118,13 +118,13 @@ class LiftMotion:
     Args:
         description: The robot.
         lift: Its lift.
-        tools: Tool link of each arm.
+        arms: At any height, by name.
     """
 
-    def __init__(self, description: RobotDescription, lift: LiftParts, tools: Mapping[str, str]) -> None:
+    def __init__(self, description: RobotDescription, lift: LiftParts, arms: Mapping[str, Arm]) -> None:
         self._joint, self._lift = description.joint(lift.joint), lift
-        chains = {name: ArmKinematics(description, tool) for name, tool in tools.items()}
-        self._robots = {name: CollisionRobot(description, chain) for name, chain in chains.items()}
+        chains = {name: ArmKinematics(description, arm.kinematics.tool_link) for name, arm in arms.items()}
+        self._robots = {n: CollisionRobot(description, chain, arms[n].robot.apart) for n, chain in chains.items()}
 
     def plan(
         self,

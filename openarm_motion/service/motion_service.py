@@ -29,7 +29,7 @@ from openarm_motion.constraints.plans import to_region
 from openarm_motion.planning import moves
 from openarm_motion.planning.alternative import explained, explained_approach, near_joints, near_pose
 from openarm_motion.planning.approach import ApproachPlan, plan_approach
-from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.arm import Arm, StartState, kept
 from openarm_motion.planning.dual_arm import DualArm, DualArmGoals, DualArmPlan, plan_any, plan_staggered, plan_together
 from openarm_motion.planning.lift import LiftedArms
 from openarm_motion.planning.moves import goal_configurations, named_posture, yielding
@@ -112,7 +112,7 @@ def make_arms(
     names = config.arms or body.arm_names
 
     def make(robot: RobotDescription) -> dict[str, Arm]:
-        return {name: Arm(name, robot, config, fixed) for name in names}
+        return {name: Arm(name, robot, config, fixed, apart=kept(body, config)) for name in names}
 
     return make(body) if body.lift is None else LiftedArms(body, make)
 

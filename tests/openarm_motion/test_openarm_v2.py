@@ -85,3 +85,20 @@ def test_the_fast_layer_is_never_more_generous(arm):
 
 def _pad(robot: RobotDescription, finger: str) -> np.ndarray:
     return next(s.T_link_primitive for s in robot.links[finger].collision if s.name == f"{finger}_pad_collision")
+
+
+@pytest.mark.requirement("R-05", "B-07")
+def test_links_that_the_design_holds_apart_are_asked_for_no_more(arm):
+    """link5 and the base of the hand are 2.3 mm apart where the wrist bends most; 3 mm are asked of all others."""
+    scene = arm.scene({**dict.fromkeys(arm.description.joints, 0.0)})
+    asked = {d for i, j, d in scene.required() if {i, j} <= set(arm.robot.moving)}
+    less = sorted(asked - {arm.config.clearance.own})
+    assert arm.config.clearance.own in asked
+    assert [round(d, 4) for d in less] == [0.0021, 0.0022]
+    rng, nearer = np.random.default_rng(5), 0
+    close = Arm(arm.name, arm.description, arm.config, [TABLE], apart={}).scene(scene.around.state)
+    for q in rng.uniform(arm.lower, arm.upper, (300, 7)):
+        if not scene.collides(q) and close.collides(q):
+            nearer += 1
+            assert all(0.002 < contact.distance < 0.003 for contact in close.contacts(q))
+    assert nearer > 10
