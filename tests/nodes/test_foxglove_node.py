@@ -8,6 +8,7 @@ import json
 import struct
 import threading
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -140,6 +141,49 @@ def test_a_service_is_called_from_foxglove(ros, foxglove: Foxglove) -> None:
 
     answer = deserialize_message(foxglove.run(call), Grasp.Response)
     assert answer.message == "asked for red"
+
+
+def test_the_meshes_of_the_description_are_served_and_no_other_file(ros, foxglove: Foxglove, tmp_path: Path) -> None:
+    from rclpy.serialization import deserialize_message
+    from std_msgs.msg import String
+
+    from openarm_common.ros.node import QOS_LATCHED
+
+    mesh, secret = tmp_path / "link 1.stl", tmp_path / "secret"
+    mesh.write_bytes(bytes(range(256)) * 9000)
+    secret.write_text("not for viewers")
+    publisher = ros.node.create_publisher(String, "/robot_description", QOS_LATCHED)
+    publisher.publish(String(data=f'<robot><mesh filename="file://{str(mesh).replace(" ", "%20")}"/></robot>'))
+
+    async def look(session: aiohttp.ClientSession) -> list[bytes | None]:
+        async with session.ws_connect(foxglove.address(), protocols=[PROTOCOL], max_msg_size=0) as socket:
+            channel = await advertised(socket, "advertise", "channels", "/robot_description")
+            await socket.send_json({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]})
+            urdf = deserialize_message(await message_of(socket, 7), String).data
+            address = urdf.split('"')[1]
+            assert address.startswith("package://")
+            name = mesh.name.replace(" ", "%20")
+            return [
+                await asset_of(socket, one)
+                for one in (
+                    address,
+                    address.replace(name, "secret"),
+                    f"file://{mesh}",
+                    address.replace(name, "./" + name),
+                )
+            ]
+
+    assert foxglove.run(look) == [mesh.read_bytes(), None, None, None]
+
+
+async def asset_of(socket: aiohttp.ClientWebSocketResponse, address: str) -> bytes | None:
+    """A fetched file; None when it is refused. Answer: opcode 4, id, status, length of the error, error, file."""
+    await socket.send_json({"op": "fetchAsset", "uri": address, "requestId": 3})
+    async for message in socket:
+        if message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 4:
+            _, _, status, length = struct.unpack_from("<BIBI", message.data)
+            return message.data[10 + length :] if status == 0 else None
+    raise AssertionError("no answer")
 
 
 @pytest.mark.parametrize(

@@ -5,18 +5,21 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
 import pytest
 
 from openarm_bringup.view import wire
+from openarm_bringup.view.assets import Assets
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import OpenArmError
 from openarm_common.octree.codec import decode, encode_states
 from openarm_common.octree.lattice import Lattice
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import robot_names
 from openarm_common.robot.meshes import read_mesh
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
@@ -48,6 +51,20 @@ def test_shapes_and_poses_put_every_shape_where_the_description_does() -> None:
         T = poses[sent["link"]].reshape(4, 4).T @ np.array(sent["pose"]).reshape(4, 4).T
         expected = description.link_pose(link.name, full) @ shape.T_link_primitive
         np.testing.assert_allclose(T, expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_viewers_can_fetch_every_mesh_of_a_description(name: str) -> None:
+    """STL, OBJ and Collada are what RViz, by `file://`, and Foxglove, by addresses of the node, read."""
+    description, assets = RobotDescription.load(name), Assets()
+    meshes = [mesh.file for link in description.links.values() for mesh in link.meshes]
+    addresses = {
+        node.attrib["filename"] for node in ElementTree.fromstring(assets.describe(description.urdf)).iter("mesh")
+    }
+    assert len(addresses) >= len(set(meshes))
+    for address in addresses:
+        assert Path(address).suffix.lower() in {".stl", ".obj", ".dae"}
+        assert assets.read(address) == Path(address.removeprefix("package://robot")).read_bytes()
 
 
 @pytest.mark.requirement("R-04")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `foxglove`: every topic of the graph, as raw CDR, and every service, to Foxglove's websocket.
 
-A topic is subscribed to only while a client of the websocket is; no message is deserialised. Stamps of the stream are
-those of /clock where there is one.
+A topic is subscribed to only while a client of the websocket is; no message is deserialised but /robot_description,
+whose meshes Foxglove fetches from here. Stamps of the stream are those of /clock where there is one.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
 
 from openarm_bringup.bags.definitions import full_definition
 from openarm_bringup.messages import interface
+from openarm_bringup.view.assets import Assets
 from openarm_bringup.view.guard import LOOPBACK, Guard
 from openarm_bringup.view.proxy import Proxy, hidden_address
 from openarm_bringup.view.viz import TOKEN_VARIABLE
@@ -33,6 +35,7 @@ from openarm_common.ros.node import BaseNode, offered_qos, run
 from openarm_common.ros.polled import Polled, Source
 
 _ENCODING, _SCHEMA = "cdr", "ros2msg"
+_DESCRIPTION = "/robot_description"
 
 
 class FoxgloveConfig(Config):
@@ -70,6 +73,7 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
         super().__init__("foxglove", FoxgloveConfig, **kwargs)
         guard = Guard(origins=self.config.origins, token=os.environ.get(TOKEN_VARIABLE))
         self._listener = _Listener()
+        self._assets = Assets()
         self._foxglove = foxglove.Context()
         hidden = hidden_address()
         self._server = foxglove.start_server(
@@ -80,6 +84,7 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
             capabilities=[Capability.Services, Capability.Time],
             supported_encodings=[_ENCODING],
             server_listener=self._listener,
+            asset_handler=self._assets.read,
             message_backlog_size=256,
         )
         self._proxy = Proxy(guard, self.config.port, f"ws://{hidden}:{self._server.port}/")
@@ -155,6 +160,9 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
         channel, kind = self._channels[topic]
 
         def forward(data: Any) -> None:
+            if topic == _DESCRIPTION and kind is String:
+                urdf = deserialize_message(data, String).data
+                data = serialize_message(String(data=self._assets.describe(urdf)))
             channel.log(data, log_time=self._now_ns())
 
         return self.create_subscription(kind, topic, forward, offered_qos(self, topic, 20), raw=True)
