@@ -23,8 +23,9 @@ from openarm_hardware.client import ServoProcess
 from openarm_hardware.exchange import State
 from openarm_hardware.touch import TouchGuard
 
-#: Most that the position of an arm's joint changes from one command to the next, rad. Controllers that give a goal up
-#: take their corrections back at once; the servo refuses a larger step as a fault of its client.
+#: Most that a command of an arm's joint is from what the servo commands, by its newest state, rad. Controllers that
+#: give a goal up take their corrections back at once; the servo refuses a larger step as a fault of its client, and on
+#: a busy machine does not take every command.
 _STEP = 0.1
 #: In these, what is commanded already is commanded again; before, where the joints are.
 _HOLDING = (Phase.RAMPING, Phase.FOLLOWING, Phase.HELD)
@@ -60,8 +61,6 @@ class MotorDriver:
         self._fingers = np.array([i for i, axis in enumerate(self._axes) if axis.grips])
         self._torque = np.array([abs(axis.torque * axis.ratio) for axis in self._axes])
         self._weight: Array = np.zeros(len(self._axes))
-        #: As commanded last; NaN: not yet since the arms follow.
-        self._position: Array = np.full(len(self._axes), np.nan)
         #: The newest state.
         self.state: State | None = None
 
@@ -84,7 +83,6 @@ class MotorDriver:
         for at, load, rest in self._arms:
             self._weight[at] = load.torque(readout.position[at], rest, rest)
         if any(phase != Phase.FOLLOWING for phase in state.phases):
-            self._position = np.full(len(self._axes), np.nan)
             self._guard.begin()
             self._stay(state, readout.position)
         self._publish(readout)
@@ -114,10 +112,9 @@ class MotorDriver:
         limits = self._controller.effort_limits()[self._fingers]
         torque[self._fingers] = np.minimum(limits, self._torque[self._fingers])
         position = self._with_torque(targets, self._weight, -1.0)
-        arms, before = self._kp > 0.0, self._position
-        if not np.isnan(before).any():
-            position = np.where(arms, np.clip(position, before - _STEP, before + _STEP), position)
-        self._position = position
+        assert self.state is not None
+        taken = np.array([motor.command for motor in self.state.motors])
+        position = np.where(self._kp > 0.0, np.clip(position, taken - _STEP, taken + _STEP), position)
         self.servo.command(list(zip(position.tolist(), torque.tolist(), strict=True)))
 
     def _touches(self) -> str:
