@@ -199,7 +199,9 @@ class InProcessRobot:
         request = ExecuteRequest(arm, trajectory, self.max_start_delay)
         await self._moved(lambda stopped: self.robot.motion.execute(request, stopped), what, guard)
 
-    async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[GraspBox] = ()) -> None:
+    async def move(
+        self, arm: str, to: str | Array, what: str, obstacles: Sequence[GraspBox] = (), *, plan_only: bool = False
+    ) -> None:
         """Move an arm on a free path to a named posture or joint positions, or its TCP on a straight line to a pose."""
         goal = NamedGoal(to) if isinstance(to, str) else JointGoal(to) if to.ndim == 1 else LineGoal(to)
         request = MoveRequest(
@@ -209,6 +211,7 @@ class InProcessRobot:
             hand_empty=True,
             scale=self._config.velocity_scale,
             max_start_delay=self.max_start_delay,
+            plan_only=plan_only,
         )
         await self._moved(lambda stopped: self.robot.motion.move(request, stopped), what)
 

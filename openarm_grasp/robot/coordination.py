@@ -109,9 +109,11 @@ class CoordinatedRobot:
         """Follow a planned trajectory, when the other arm leaves clearance for it."""
         await self._patiently(lambda: self._robot.follow(arm, trajectory, what, guard), what)
 
-    async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = ()) -> None:
+    async def move(
+        self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
+    ) -> None:
         """Move an arm to a named posture, or its TCP to a pose."""
-        await self._patiently(lambda: self._robot.move(arm, to, what, obstacles), what)
+        await self._patiently(lambda: self._robot.move(arm, to, what, obstacles, plan_only=plan_only), what)
 
     # --- the other arm
     async def _patiently(self, work: Callable[[], Awaitable[T]], what: str) -> T:

@@ -173,10 +173,12 @@ class RobotInterface(Protocol):
     ) -> None:
         """Follow a planned trajectory."""
 
-    async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = ()) -> None:
+    async def move(
+        self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
+    ) -> None:
         """Move an arm on a free path to a named posture, or its TCP on a straight line to a pose (4, 4).
 
-        The lift goes to a position (1,), m.
+        The lift goes to a position (1,), m. `plan_only`: nothing moves; raises what the motion would be refused with.
         """
 
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:

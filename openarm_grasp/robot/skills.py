@@ -245,10 +245,24 @@ class Skills:
         self.robot.check()
         await self.robot.move(arm, T_base_tcp, f"{arm} arm: {what}")
 
-    async def move_lift(self, position: float) -> None:
-        """Move the lift that carries the arms, while they keep their postures, m."""
+    async def move_lift(self, position: float, *, plan_only: bool = False) -> None:
+        """Move the lift that carries the arms, while they keep their postures, m; or only plan that."""
         self.robot.check()
-        await self.robot.move(LIFT, np.array([position]), "lift")
+        await self.robot.move(LIFT, np.array([position]), "lift", plan_only=plan_only)
+
+    async def stuck(self) -> bool:
+        """Whether no arm can move at all, since each starts in collision: nothing but a person frees it."""
+        for arm in self.description.arm_names:
+            _, q = self.robot.states.latest()
+            here = np.array([q[name] for name in self.description.arm_joints(arm)])
+            try:
+                await self.robot.move(arm, here, f"{arm} arm", plan_only=True)
+            except OpenArmError as error:
+                if error.code == Code.IN_COLLISION:
+                    continue
+                reraise_stop(error)
+            return False
+        return True
 
     def lift_position(self) -> float:
         """Position of the lift, m; 0 without one."""

@@ -249,11 +249,14 @@ class GraphRobot:
         goal = ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_start_delay=self.max_start_delay)
         await self._moved(arm, self._execute, goal, what, guard)
 
-    async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = ()) -> None:
+    async def move(
+        self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
+    ) -> None:
         """Ask /motion/move."""
         goal = messages.move_goal(
             arm, self.base_frame, to, obstacles, self._config.velocity_scale, self.max_start_delay
         )
+        goal.plan_only = plan_only
         await self._moved(arm, self._move, goal, what)
 
     async def _moved(

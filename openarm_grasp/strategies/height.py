@@ -55,6 +55,7 @@ async def height(task: Task) -> GraspOutcome | None:
     found, faults = task.findings.need_sighting(), list[str]()
     for position in heights(task):
         try:
+            await task.robot.move_lift(position, plan_only=True)  # milliseconds, where a grasp takes seconds
             planned = await _planned(task, found, position)
             if task.request.dry_run:
                 return replace(refused, code=Code.OK, message=f"can be done: {planned}", proof=Feasible(str(planned)))

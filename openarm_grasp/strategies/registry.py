@@ -59,7 +59,7 @@ async def carry_out(task: Task) -> GraspOutcome:
             return task.answer(GraspOutcome(Code.INTERNAL, text, task.request.label), "")
         if outcome is not None:
             task.outcome = outcome
-            if not task.may_go_on(outcome):
+            if not task.may_go_on(outcome) or await task.robot.stuck():
                 return task.answer(outcome, route)
     if task.outcome is None:
         raise OpenArmError(Code.INTERNAL, f"none of the strategies {', '.join(STRATEGIES)} answered")

@@ -304,6 +304,9 @@ class World(Skills):
         self.call(GoHome(tuple(arms), tuple(obstacles)))
         self.pass_time(1.0)
 
+    async def stuck(self) -> bool:
+        return False
+
     def aperture(self, arm: str) -> float:
         return self.gap
 

@@ -49,3 +49,19 @@ def test_where_nothing_is_in_reach_the_lift_goes_to_another_height(monkeypatch: 
     (grasp,) = trials.run()["grasps"]
     assert (grasp["outcome"], grasp["route"], grasp["attempts"]) == ("placed", "height", 1), grasp["message"]
     assert trials.skills.lift_position() < high - 0.05
+
+
+@pytest.mark.requirement("R-05")
+def test_arms_that_touch_the_cell_are_said_so_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the lift at its top no arm can move: no other route is planned from there."""
+    monkeypatch.setenv(ROBOT, "openarm_v2_cell")
+    lift = RobotDescription.load().joint("openarm_lifter_joint")
+    near = {**FAR, "position": [0.42, -0.30]}
+    task = Task("nominal", 1, parse_scene({"objects": [near]}, "near"), ("red",), posture={lift.name: lift.upper})
+    trials = Trials(task, SimulatedSenses(depth_noise=True), GraspConfig())
+    trials.robot.pass_time(0.5)
+    request = GraspRequest("red", dry_run=True)
+    answer = trials.link.run(carry_out(GraspTask(trials.session, trials.skills, request, lambda status: None)))
+    assert (answer.code, "starts in collision" in answer.message) == (Code.IN_COLLISION, True)
+    assert "height" not in answer.message
+    assert answer.duration < 2.0
