@@ -7,7 +7,8 @@ Contact only, position targets at 100 Hz, poses that are off by 3 mm and 3 degre
 minutes of one core (--quick: one).
 
     trials_ok              of 54: six objects, nine poses each; approach, close, lift, hold 10 s, shake, put back, leave
-                           (8 cm leaves 4 mm a side in the open hand, less than many of the pose errors)
+                           (8 cm leaves 4 mm a side in the open hand, less than many of the pose errors; left out where
+                           it does not go into the hand)
     hold_slip_max_mm       in the hand within the 10 s
     shake_slip_max_mm      while shaken (2 cm at 2.5 Hz, 1 cm at 3 Hz)
     penetration_max_mm     of a pad into an object

@@ -32,7 +32,7 @@ SIDES = ROBOT.arm_names[::-1]
 TABLE, MEASURES = WORK.table, next(iter(ROBOT.hands.values())).parts
 OPEN, LIFT, BACK = MEASURES.opening, 0.12, 0.08
 
-OBJECTS = {
+_OBJECTS = {
     "cube_4cm": ("box", (0.04, 0.04, 0.04), 0.064),
     "cube_5cm": ("box", (0.05, 0.05, 0.05), 0.10),
     "box": ("box", (0.04, 0.06, 0.08), 0.15),
@@ -40,6 +40,8 @@ OBJECTS = {
     "can": ("cylinder", (0.066, 0.066, 0.115), 0.35),
     "cube_8cm": ("box", (0.08, 0.08, 0.08), 0.25),  # leaves 4 mm a side in the open hand
 }
+#: Those that go between the pads of the open hand.
+OBJECTS = {kind: shape for kind, shape in _OBJECTS.items() if min(shape[1][:2]) < 2.0 * OPEN - 0.001}
 #: Kept from joint limits, rad.
 _MARGIN = 0.05
 #: MuJoCo's own contact and solver settings, and the finger force of the v2 hand.

@@ -43,6 +43,7 @@ from benchmarks.motion_problems import (
 from benchmarks.report import Row, write_report
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
+from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
 from openarm_common.types import Array
@@ -51,6 +52,7 @@ from openarm_motion.collision.occupancy import Environment
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.dual_arm import DualArm
+from openarm_motion.planning.moves import RequestBoxes, to_pose
 from openarm_motion.planning.ompl_planner import OmplPlanner
 from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.rrt import FastPlanner
@@ -153,6 +155,27 @@ def check_rows(both: DualArm, home: Mapping[str, float], count: int) -> list[Row
     ]
 
 
+def pose_rows(arms: Mapping[str, Arm], home: Mapping[str, float], count: int) -> list[Row]:
+    """A pose of the tool to a validated trajectory from home, of poses in which nothing of the robot touches."""
+    rng, times, planned = np.random.default_rng(4), list[float](), 0
+    for k in range(count):
+        arm = list(arms.values())[k % len(arms)]
+        scene = arm.scene(home)
+        pose = arm.kinematics.fk(random_free(arm, rng, lambda q, s=scene: any(c.distance <= 0 for c in s.contacts(q))))
+        begin = time.process_time()
+        try:
+            to_pose(arm, arm.start_state(home), pose, RequestBoxes())
+            planned += 1
+        except OpenArmError as error:
+            print(f"pose {k}: {error}")
+        times.append(time.process_time() - begin)
+    return [
+        Row("pose_p50", _p(times, 50), "ms", "lower", 10.0, n=count),
+        Row("pose_p95", _p(times, 95), "ms", "lower", 50.0, n=count),
+        Row("pose_planned", 100.0 * planned / count, "%", "higher", 99.0, n=count),
+    ]
+
+
 def ros_rows(count: int) -> list[Row]:
     """A pose to the running node until its trajectory is back; the same node with another planner as the peer."""
     times, peer = _through_ros("fast", count)[0], _through_ros("ompl", count)[0]
@@ -200,7 +223,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer problems: within two minutes")
     parser.add_argument(
-        "--only", default="", help="parts whose name begins so: ik, check, table, shelf, dual, ros, moveit"
+        "--only", default="", help="parts whose name begins so: pose, ik, check, table, shelf, dual, ros, moveit"
     )
     parser.add_argument("--tuning", action="store_true", help="the problems that steps of the search were chosen on")
     parser.add_argument("--json", type=Path)
@@ -223,6 +246,7 @@ def main() -> None:
         return (few if quick else most), seeds[name]
 
     parts: dict[str, Callable[[], list[Row]]] = {
+        "pose": lambda: pose_rows(arms, home, 60 if quick else 300),
         "ik": lambda: ik_rows(arms, 1000 if quick else 20_000, 20 if quick else 150),
         "table": lambda: single("table", table_problems(sides, home, *problems("table", 200, 30)), (1.0, 5.0)),
         "shelf": lambda: single("shelf", shelf_problems(sides, home, *problems("shelf", 100, 10)), (10.0, 50.0)),
