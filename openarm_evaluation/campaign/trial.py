@@ -129,15 +129,15 @@ class Trials:
             trial = self._grasp(ask)
             answer, touched = trial.answer, trial.answer.attempts > 0
             held = ask.phase != "place" and isinstance(answer, GraspOutcome) and answer.kind == "PARTIAL"
-            order.done(ask, Code(answer.code), answer.message, *self._ends, touched=touched, held=held)
+            left = order.done(ask, Code(answer.code), answer.message, *self._ends, touched=touched, held=held)
             self._seconds += trial.sim_s
             if answer.success:
                 placed.append(trial)
                 continue
             label = order.label_of(ask)
-            if order.left and order.left[-1].label == label:
-                open_.setdefault(order.left[-1], trial)  # that nothing else of the label is in view says nothing of it
-            else:
+            if left is not None:
+                open_[left] = trial
+            elif all(one.label != label for one in order.left):  # else it says of nothing new that it is not in view
                 open_[label] = trial
             if touched and not clear:  # three attempts are what a scene may take
                 order.failed[label] = answer.message

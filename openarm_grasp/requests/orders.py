@@ -181,8 +181,8 @@ class Order:
         *,
         touched: bool = False,
         held: bool = False,
-    ) -> None:
-        """Note what came of a request.
+    ) -> Left | None:
+        """Note what came of a request, and return what it leaves; None for nothing that was not left before.
 
         Args:
             request: From `next`.
@@ -193,11 +193,11 @@ class Order:
             touched: An arm has moved for it.
             held: A hand may hold it still: it is put down before anything else.
         """
-        label = self.label_of(request)
+        label, before = self.label_of(request), tuple(self.left)
         self.left = [one for one in self.left if one.label != label or one.where is not None]
         placing, self._held = request.phase == "place", label if held else ""
         if placing and code is Code.NOT_READY:
-            return  # no hand holds anything: it is where it was seen last
+            return None  # no hand holds anything: it is where it was seen last
         if placing and self.left and code is Code.OK:
             self.left.pop()  # what was left in the hand
         unseen = seen is None and code in _NOT_SEEN
@@ -215,6 +215,7 @@ class Order:
             self.left.append(Left(label, where, code, message, len(self.placed)))
             if (where is None and not unseen) or self._in_vain >= _IN_VAIN:
                 self._ended[label], self._in_vain = len(self.placed), 0
+        return next((one for one in self.left if one not in before), None)
 
     def _none_left(self, label: str, code: Code, message: str) -> None:
         """Nothing more of a label is in view besides what was left: that is tried again if it may have become free."""
