@@ -126,7 +126,7 @@ def left_out(real: RealSet, fit: Callable[[Indices], Array]) -> Array:
             out.append(np.full(3, math.nan))
             continue
         one = problem.subset([i])
-        out.append(np.sqrt(column_squares(one, T[i : i + 1], one.camera_rows())[0]))
+        out.append(np.sqrt(column_squares(one, T[i : i + 1])[0]))
     return np.array(out)
 
 

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which model of the residuals is right? The one whose answer predicts left-out poses better than the closed forms do.
+"""Which model of the residuals is right? The one that predicts left-out poses better, by a proper score.
 
 By its likelihood a misfit, which the marks of a view share, is right where lens or board bend the image, and wrong
-where a few large errors of the robot pass for it: it then buys pixels with degrees. Poses that are left out decide. The
-worst column of an answer counts (px, m, rad, each against the best closed form of it): with a misfit it must be
-better than the closed forms, or than without, by a standard error, else the simpler model is taken (the
-one-standard-error rule, Breiman et al. 1984, "Classification and Regression Trees"). m, rad, px.
+where a few large errors of the robot pass for it. Poses that are left out decide: the score is the log density of their
+errors (translation of the board's centre, rotation), as normal with a covariance of its own, the likeliest one. That is
+the determinant of their second moments, which weighs metres against radians by what the data have of each (logarithmic
+score; Gneiting and Raftery 2007, "Strictly proper scoring rules, prediction, and estimation"). Where closed forms
+beat an answer in the image, in position or in rotation, the one that they beat by less is taken. m, rad, px.
 """
 
 from __future__ import annotations
@@ -22,6 +23,11 @@ from openarm_calibration.handeye.unknowns import Solution
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 
+#: Errors of six numbers: of no more poses than that the determinant is zero.
+_FEWEST = 6
+#: Errors within a hundredth of each other are the same.
+_TIE = 1.01
+
 
 def solve_chosen(problem: Problem, config: SolveConfig | None = None) -> Solution:
     """Solve for the mounts of one camera and one board, with a misfit or without, as left-out poses have it.
@@ -35,9 +41,8 @@ def solve_chosen(problem: Problem, config: SolveConfig | None = None) -> Solutio
     """
     config = config or SolveConfig()
     solution = solve(problem, config)
-    part = problem.subset(solution.used)
     single = problem.cameras == 1 and problem.boards == 1 and bool((problem.kind < 2).all())
-    if solution.estimate.noise.misfit == 0.0 or not single:
+    if solution.estimate.noise.misfit == 0.0 or not single or np.count_nonzero(solution.used) <= _FEWEST:
         return solution
     try:
         plain = solve(problem, config.model_copy(update={"misfit": False}))
@@ -45,16 +50,16 @@ def solve_chosen(problem: Problem, config: SolveConfig | None = None) -> Solutio
         if error.code != Code.DEGENERATE:
             raise
         return solution
-    best = np.min([closed_columns(part, method) for method in METHODS], axis=0)
-    with_misfit, error = _worst(held_out(problem, solution, len(problem)), best)
-    without, plain_error = _worst(held_out(problem, plain, len(problem)), best)
-    return solution if with_misfit < max(1.0 - error, without - plain_error) else plain
+    part = problem.subset(solution.used)
+    best = np.nanmin([closed_columns(part, method) for method in METHODS], axis=0)
+    ours, others = (_rank(held_out(problem, answer, len(problem)), best) for answer in (solution, plain))
+    return plain if others < ours else solution
 
 
-def _worst(held: Held, best: Array) -> tuple[float, float]:
-    """Return the largest of the columns over those of the best closed forms (3,), and its standard error."""
-    mean = np.nan_to_num(held.squares, nan=math.inf).mean(axis=0)  # a mark behind the camera
-    ratio = np.sqrt(mean) / best
-    column = int(np.argmax(ratio))
-    spread = float(np.std(held.squares[:, column], ddof=1)) / math.sqrt(len(held.squares))
-    return float(ratio[column]), 0.5 * float(ratio[column]) * spread / float(mean[column])
+def _rank(held: Held, best: Array) -> tuple[float, float]:
+    """Return how far closed forms with errors (3,) beat an answer in any column, then its score; the lower the better.
+
+    The score is the mean of minus twice the log density of left-out poses, up to a constant.
+    """
+    score = np.linalg.slogdet(held.twists.T @ held.twists / len(held.twists))[1]
+    return max(float(np.nan_to_num(held.columns / best, nan=math.inf).max()), _TIE), float(score)

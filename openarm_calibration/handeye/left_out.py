@@ -36,14 +36,16 @@ class Held:
         metres: The same at the board's distance.
         by_name: Both by view.
         marks: Mean squared distance of the marks in space, against the view's own pose of the board, by view, m².
-        squares: (views, 3) see `column_squares`.
+        twists: (views, 6) see `board_twists`.
+        columns: (3,) rms errors by column, see `column_squares`.
     """
 
     px: float
     metres: float
     by_name: dict[str, tuple[float, float]]
     marks: dict[str, float] = field(default_factory=dict)
-    squares: Array = field(default_factory=lambda: np.full((1, 3), math.nan))
+    twists: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    columns: Array = field(default_factory=lambda: np.full(3, math.nan))
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
     folds = max(2, min(folds, len(poses)))
     squares: dict[str, tuple[float, float]] = {}
     marks: dict[str, float] = {}
-    columns: list[Array] = []
+    twists: list[Array] = []
     for fold in range(folds):
         out = np.isin(problem.pose[used], poses[fold::folds])
         if len(np.unique(problem.pose[used[~out]])) < 3:
@@ -97,7 +99,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
         T, _ = chain(left, estimate.X, estimate.Z)
         rows = left.camera_rows(estimate.optics)
         in_space = in_space_squares(left, T)
-        columns.append(column_squares(left, T, rows))
+        twists.append(board_twists(left, T))
         for k, view in enumerate(left.views):
             away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
             px = float(np.mean(np.sum(away**2, axis=1)))
@@ -108,29 +110,43 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
         return Held(math.nan, math.nan, {})
     px2, m2 = np.mean(list(squares.values()), axis=0)
     by_name = {name: (math.sqrt(a), math.sqrt(b)) for name, (a, b) in squares.items()}
-    return Held(math.sqrt(px2), math.sqrt(m2), by_name, marks, np.concatenate(columns))
+    errors = np.concatenate(twists)
+    columns = np.sqrt([px2, np.mean(np.sum(errors[:, :3] ** 2, axis=1)), np.mean(np.sum(errors[:, 3:] ** 2, axis=1))])
+    return Held(math.sqrt(px2), math.sqrt(m2), by_name, marks, errors, columns)
 
 
-def column_squares(problem: Problem, T: Array, rows: Array) -> Array:
+def board_twists(problem: Problem, T: Array) -> Array:
+    """Return (n, 6) errors of poses T (n, 4, 4): of the board's centre, m, and rotation vector, rad; optical axes.
+
+    Args:
+        problem: The views, whose own poses of the board the errors are against.
+        T: Predicted T_camera_board.
+    """
+    out = np.zeros((len(problem), 6))
+    for k, view in enumerate(problem.views):
+        centre, own = np.append(view.points.mean(axis=0), 1.0), problem.free[k]
+        out[k, :3] = ((T[k] - own) @ centre)[:3]
+        out[k, 3:] = se3.log_so3(T[k, :3, :3] @ own[:3, :3].T)
+    return out
+
+
+def column_squares(problem: Problem, T: Array) -> Array:
     """Return (n, 3) squared errors of poses T (n, 4, 4): marks in the image, px; board's centre, m; angle, rad.
 
     Args:
         problem: The views; the last two are against their own poses of the board.
         T: Predicted T_camera_board.
-        rows: (n, 6) of the cameras, see `Problem.camera_rows`.
     """
-    out = np.zeros((len(problem), 3))
-    for k, view in enumerate(problem.views):
-        away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
-        centre, own = np.append(view.points.mean(axis=0), 1.0), problem.free[k]
-        out[k, 0] = np.mean(np.sum(away**2, axis=1))
-        out[k, 1] = np.sum(((T[k] - own) @ centre)[:3] ** 2)
-        out[k, 2] = se3.angle_between(T[k, :3, :3], own[:3, :3]) ** 2
-    return out
+    twists, rows = board_twists(problem, T), problem.camera_rows()
+    px = [
+        np.mean(np.sum((project(view.points, view.radius, T[k], rows[k]) - view.pixels) ** 2, axis=1))
+        for k, view in enumerate(problem.views)
+    ]
+    return np.stack([px, np.sum(twists[:, :3] ** 2, axis=1), np.sum(twists[:, 3:] ** 2, axis=1)], axis=1)
 
 
 def closed_columns(problem: Problem, method: str) -> Array:
-    """Return the rms errors (3,) of poses that a closed form did not see: px, m, rad; infinite where it has no answer.
+    """Return the rms errors (3,) of poses that a closed form did not see: px, m, rad; NaN where it has no answer.
 
     Args:
         problem: Of one camera and one board.
@@ -142,9 +158,9 @@ def closed_columns(problem: Problem, method: str) -> Array:
         try:
             mounts = closed_form(method, known.views[0].setup, known.A, known.free)
         except OpenArmError:
-            return np.full(3, math.inf)
+            return np.full(3, math.nan)
         T, _ = chain(left, mounts.X[None], mounts.Z[None])
-        squares.append(column_squares(left, T, left.camera_rows()))
+        squares.append(column_squares(left, T))
     return np.sqrt(np.concatenate(squares).mean(axis=0))
 
 
