@@ -22,7 +22,7 @@ from typing import Any
 
 import rclpy
 import trimesh
-from pymoveit2 import GripperInterface, MoveIt2, MoveIt2Gripper, MoveIt2State, RobotDescription
+from pymoveit2 import GripperInterface, MoveIt2, MoveIt2Gripper, MoveIt2Servo, MoveIt2State, RobotDescription
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
@@ -250,11 +250,48 @@ class Programs:
         self.wait(lambda: self.gripper.is_open)
         return "closed and opened"
 
+    def servo_twist(self) -> str:
+        """Draw the tool back by a twist in its own frame."""
+        return self.servoed(lambda servo: servo.servo(linear=(0.0, 0.0, -1.0)))
+
+    def servo_jog(self) -> str:
+        """Turn the last joint away from its nearest limit."""
+        self.wait(lambda: self.arm.joint_state is not None)
+        state = self.arm.joint_state
+        last = self.names["joint_names"][-1]
+        speed = -0.5 if state.position[list(state.name).index(last)] > 0.0 else 0.5
+        return self.servoed(lambda servo: servo.servo_jog((last,), (speed,)))
+
+    def servoed(self, send: Callable[[MoveIt2Servo], bool]) -> str:
+        """Servo for half a second, and rest."""
+        before = self.here()
+        with MoveIt2Servo(
+            self.node,
+            self.names["end_effector_name"],
+            linear_speed=0.3,
+            callback_group=self.group,
+            enable_at_init=False,
+        ) as servo:
+            if not servo.enable(sync=True):
+                raise RuntimeError("servoing was not started")
+            self.wait(lambda: send(servo))
+            for _ in range(50):
+                send(servo)
+                time.sleep(0.01)
+            if not servo.disable(sync=True):
+                raise RuntimeError("servoing was not stopped")
+        time.sleep(0.5)
+        after = self.here()
+        moved = max(abs(a - b) for x, y in zip(before, after, strict=True) for a, b in zip(x, y, strict=True))
+        if moved < 0.01:
+            raise RuntimeError(_MISS)
+        return f"moved by {moved:.3f}"
+
 
 PROGRAMS = (
     *("joint_goal", "fk", "ik", "pose_goal", "cartesian", "orientation_path_constraint", "move_group_action"),
     *("asynchronous", "cancelled", "collision_primitive", "collision_mesh", "allow_collisions", "attach"),
-    *("clear_planning_scene", "gripper_group"),
+    *("clear_planning_scene", "gripper_group", "servo_twist", "servo_jog"),
 )
 
 

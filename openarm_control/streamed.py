@@ -14,11 +14,11 @@ from typing import Protocol
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.pacing import Pacer, PeriodMeter
 from openarm_common.types import Array
 from openarm_control.controller import RobotController
 from openarm_control.joints import JointReadout
 from openarm_control.loop import ControlLoop
-from openarm_control.pacing import Pacer, PeriodMeter
 
 PERIOD_NS = 10_000_000
 #: Joint states that are further apart than this, rad (fingers: m), and what these move meanwhile, rad/s (m/s), are of a

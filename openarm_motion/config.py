@@ -166,6 +166,60 @@ class MoveGroupConfig(Config):
     clear_map: str = Field(default="/octomap/reset", description="service that /clear_octomap calls")
 
 
+class ServoScaleConfig(Config):
+    """What 1 is in a command without units."""
+
+    linear: float = Field(default=0.4, gt=0.0, le=2.0, description="of the tool, m/s")
+    rotational: float = Field(default=0.8, gt=0.0, le=6.0, description="of the tool, rad/s")
+    joint: float = Field(default=0.5, gt=0.0, le=6.0, description="of a joint, rad/s or m/s")
+
+
+class ServoClearance(Clearance):
+    """Distances kept while servoing, m, in addition to what `lag` asks for."""
+
+    own: float = Field(default=0.001, ge=0.0, le=0.05, description="between links, and to the robot's body, m")
+    world: float = Field(default=0.005, ge=0.0, le=0.1, description="arm to boxes, m")
+    arms: float = Field(default=0.020, ge=0.0, le=0.1, description="arm to the other arm, m")
+    hand: float = Field(default=0.005, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
+
+
+class ServoConfig(Config):
+    """How arms follow twists and joint velocities; names as MoveIt Servo has them."""
+
+    enabled: bool = Field(default=True, description="whether the node servo_node is there; false next to MoveIt's own")
+    command_in_type: Literal["unitless", "speed_units"] = Field(
+        default="unitless", description="unitless: -1 to 1, times scale; speed_units: m/s and rad/s"
+    )
+    scale: ServoScaleConfig = Field(default_factory=ServoScaleConfig, description="of commands without units")
+    publish_period: float = Field(default=0.01, ge=0.004, le=0.05, description="from one set point to the next, s")
+    incoming_command_timeout: float = Field(
+        default=0.025, ge=0.01, le=1.0, description="the arm stops when no command came for so long, s"
+    )
+    lower_singularity_threshold: float = Field(
+        default=17.0, gt=1.0, description="condition number of the Jacobian from which on twists are slowed"
+    )
+    hard_stop_singularity_threshold: float = Field(
+        default=30.0, gt=1.0, description="condition number at which twists that raise it stop"
+    )
+    joint_limit_margin: float = Field(default=0.05, ge=0.0, le=0.5, description="kept from joint limits, rad")
+    lookahead: float = Field(
+        default=0.12, ge=0.0, le=1.0, description="an arm is slowed so that it may go on for so long and then stop, s"
+    )
+    clearance: ServoClearance = Field(default_factory=ServoClearance, description="distances kept while servoing")
+    lag: float = Field(
+        default=0.005, ge=0.0, le=0.05, description="joints may be this far from their set points, rad: adds clearance"
+    )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> ServoConfig:
+        low, high = self.lower_singularity_threshold, self.hard_stop_singularity_threshold
+        if high <= low:
+            raise ValueError(
+                f"hard_stop_singularity_threshold {high:g} must exceed lower_singularity_threshold {low:g}"
+            )
+        return self
+
+
 class MotionConfig(Config):
     """Parameters of the motion node."""
 
@@ -186,3 +240,4 @@ class MotionConfig(Config):
     execution: ExecutionConfig = Field(default_factory=ExecutionConfig, description="monitoring of execution")
     faults: FaultsConfig = Field(default_factory=FaultsConfig, description="fault injection")
     move_group: MoveGroupConfig = Field(default_factory=MoveGroupConfig, description="MoveIt's names")
+    servo: ServoConfig = Field(default_factory=ServoConfig, description="twists and joint velocities")

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.pacing import Pacer, PeriodMeter, RateDivider, RealTimeFactor
 from openarm_common.types import Array
 from openarm_control.joints import JointReadout
 from openarm_control.loop import ControlLoop
-from openarm_control.pacing import Pacer, PeriodMeter, RateDivider, RealTimeFactor
 from openarm_sim_bridge.robot import SimulatedRobot
 
 #: Stamps that are further than this from the wall clock, ns, are set to it.

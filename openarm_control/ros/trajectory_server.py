@@ -58,6 +58,7 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
     ) -> None:
         self._arm = arm
         self._running: ServerGoalHandle | None = None
+        self._replacing = False
         controller = f"{prefix}/{side}_joint_trajectory_controller"
         self._feedback_timer = node.create_timer(
             FEEDBACK_PERIOD_S, self._publish_feedback, clock=node.steady_clock, autostart=False
@@ -106,12 +107,21 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         try:
             self._check(b"")
             trajectory = self._arm.check(trajectory_of(FollowJointTrajectory.Goal(trajectory=message)))
-            await self._node.awaitable(self._loop.call(lambda: self._start(trajectory, self._on_end)))
+            await self._node.awaitable(self._loop.call(lambda: self._replace(trajectory)))
         except OpenArmError as error:
-            self._node.get_logger().error(f"{self._label}: joint_trajectory refused: {error}")
+            text = f"{self._label}: joint_trajectory refused: {error}"
+            self._node.get_logger().error(text, throttle_duration_sec=1.0)
+
+    def _replace(self, trajectory: Trajectory) -> None:
+        """Follow a trajectory of a message in place of that of the last one, which is no failure of it."""
+        self._replacing = True
+        try:
+            self._start(trajectory, self._on_end)
+        finally:
+            self._replacing = False
 
     def _on_end(self, outcome: TrajectoryOutcome) -> None:
-        if outcome.end is not End.SUCCEEDED:
+        if outcome.end is not End.SUCCEEDED and not self._replacing:
             self._node.get_logger().warning(f"{self._label}: {outcome.text}")
 
     async def _execute(self, handle: ServerGoalHandle) -> FollowJointTrajectory.Result:

@@ -22,7 +22,7 @@ from openarm_common.robot.servos import ArmLoad, ServoModel
 from openarm_common.ros.node import run, until_shutdown
 from openarm_control.controller import RobotController
 from openarm_control.joints import JointReadout, arm_groups, arm_loads, carriers, gripper_groups, joint_names
-from openarm_control.pacing import RateDivider
+from openarm_common.pacing import RateDivider
 from openarm_control.ros.controllers import Controllers
 from openarm_control.ros.process import ControlNode, timely
 from openarm_control.ros.robot_publisher import RobotPublisher

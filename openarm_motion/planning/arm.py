@@ -20,7 +20,7 @@ from openarm_common.collision.held_apart import held_apart
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
-from openarm_motion.collision.exact import CollisionContext, CollisionScene, Contact
+from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene, Contact
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.line_checks import LineChecks, spread
 from openarm_motion.collision.occupancy import NOTHING, Environment
@@ -314,6 +314,7 @@ class Arm(PlanningGroup):
         environment: Environment = NOTHING,
         carried: Sequence[tuple[int, Box]] = (),
         arms: float | None = None,
+        clearance: Clearance | None = None,
     ) -> CollisionScene:
         """Surroundings of the arm with the table in them.
 
@@ -327,8 +328,10 @@ class Arm(PlanningGroup):
             environment: Bodies of the planning scene, as certain as the table, the map, and the distance of the arms.
             carried: What goes with the other arm, see `CollisionContext`.
             arms: Distance that the arms keep from each other instead of that of clearance and environment, m.
+            clearance: Instead of that of free paths.
         """
-        clearance = self.config.straight if straight else self.config.clearance
+        if clearance is None:
+            clearance = self.config.straight if straight else self.config.clearance
         apart = max(clearance.arms, environment.arm_clearance) if arms is None else arms
         certain = (*self.static, *environment.solids)
         fixed = frozenset(body.id for body in certain)

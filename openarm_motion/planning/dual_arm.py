@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.exact import CollisionScene, Contact
+from openarm_motion.collision.exact import Clearance, CollisionScene, Contact
 from openarm_motion.collision.line_checks import LineChecks
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.solids import Box
@@ -130,6 +130,7 @@ class DualArm(PlanningGroup):
         separation: float = SEPARATION,
         held: tuple[Sequence[Box], Sequence[Box]] = ((), ()),
         environment: Environment = NOTHING,
+        clearance: Clearance | None = None,
     ) -> DualArmScene:
         """Surroundings of both arms with the table in them.
 
@@ -139,10 +140,19 @@ class DualArm(PlanningGroup):
             separation: Distance that the arms keep from each other, m.
             held: Boxes held by each arm, its tool frame.
             environment: Bodies of the planning scene and the map.
+            clearance: Other distances, instead of that of free paths.
         """
         carried = [arm.robot.on_tool(mine) for arm, mine in zip(self.arms, held, strict=True)]
         first, second = (
-            arm.scene(state, boxes, held[i], environment=environment, carried=carried[1 - i], arms=separation)
+            arm.scene(
+                state,
+                boxes,
+                held[i],
+                environment=environment,
+                carried=carried[1 - i],
+                arms=separation,
+                clearance=clearance,
+            )
             for i, arm in enumerate(self.arms)
         )
         return DualArmScene(first, second, self.split)

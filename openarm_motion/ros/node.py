@@ -3,8 +3,8 @@
 
 Actions /motion/plan_approach, /motion/move, /motion/move_arms and /motion/execute; services /motion/compute_ik,
 /motion/apply_scene and /motion/get_scene; latched /motion/scene, /motion/preview and /motion/attached_objects. Poses
-are in the base frame or any frame that the description or /tf_static knows. The node `move_group` of the same process
-answers to MoveIt's names.
+are in the base frame or any frame that the description or /tf_static knows. The nodes `move_group` and
+`servo_node` of the same process answer to MoveIt's names.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ AnswerT = TypeVar("AnswerT", bound=MotionAnswer)
 RequestT = TypeVar("RequestT")
 MovingT = TypeVar("MovingT", ExecuteRequest, MoveRequest, MoveArmsRequest)
 
-#: An adapter that is imported, with MoveIt's messages, where it is wanted.
-_MOVE_GROUP = "openarm_motion.ros.move_group.node"
+#: Adapters that are imported, with MoveIt's messages, where they are wanted.
+_MOVE_GROUP, _SERVO = "openarm_motion.ros.move_group.node", "openarm_motion.ros.servo_node"
 #: Pace of feedback while planning, s.
 _FEEDBACK = 0.1
 #: Arms that move have this long to come to rest when the process is to end, s.
@@ -92,6 +92,10 @@ class MotionNode(BaseNode[MotionConfig]):
             group = kind(self.service, config.move_group, config.controller, self._holds.check, context=self.context)
             group.on_scene = self._show_scene
             self.companions = (group,)
+        if config.servo.enabled:
+            kind = importlib.import_module(_SERVO).ServoNode
+            servo = kind(self.service, config.servo, config.controller, self._holds.check, context=self.context)
+            self.companions = (*self.companions, servo)
         for arm in arms.values():
             self.get_logger().info(f"{arm.name} arm: {', '.join(arm.names)}; inverse kinematics: {arm.inverse.method}")
 

@@ -14,6 +14,7 @@ from openarm_motion.collision.occupancy import Environment, carried
 from openarm_motion.collision.solids import Box
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm, Scale, StartState
+from openarm_motion.planning.planner import never
 from openarm_motion.scene.held import HeldObjects
 from openarm_motion.scene.map_view import MapState, MapView, unexplained
 from openarm_motion.scene.planning_scene import PlanningScene
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 #: Next to an arm under way plans keep this distance from where it will end, m: more than what is then proven.
 _NEXT_TO = 0.035
+#: Other joints that move less than this are where they were, rad or m.
+_STILL = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,21 @@ class Prepared:
     version: int
     note: str
     complete: Callable[[], StartState]
+
+
+@dataclass(frozen=True, eq=False)
+class Around:
+    """What is around all arms.
+
+    Attributes:
+        prepared: As for a plan of all of them.
+        held: What each holds, tool frame.
+        seen: Equal as long as it is the same.
+    """
+
+    prepared: Prepared
+    held: tuple[Sequence[Box], ...]
+    seen: object
 
 
 class PlanningContext:
@@ -116,6 +134,18 @@ class PlanningContext:
         # a graph without a map is as it should be; one with an old map is not
         note = f" without the map: {view.why}" if view.why and view.version else ""
         return Prepared(now, self._scene.version, note, complete)
+
+    def around_all(self, seen: object) -> Around | None:
+        """Return what is around all arms; None where it is as when it was `seen`. Raises as `prepare`."""
+        arms = list(self._arms.values())
+        held = tuple(self._held.held.get(arm.name, ()) for arm in arms)
+        joints = {name for arm in arms for name in arm.names}
+        state = self._robot.states.latest()[1]
+        others = tuple(round(q / _STILL) for name, q in sorted(state.items()) if name not in joints)
+        now = (self._scene.version, self.map_state().version, held, others, arms)
+        if now == seen:
+            return None
+        return Around(self.prepare(arms, (), 0.0, never, (), held), held, now)
 
     def start(self, arm: Arm, start: Sequence[float] | Array, scale: Scale, stopped: Callable[[], bool]) -> StartState:
         """Take the joints alone, without scene and map; arguments as `prepare`."""

@@ -7,8 +7,7 @@ ROS; a campaign calls it in process.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -37,7 +36,8 @@ from openarm_motion.planning.planner import never
 from openarm_motion.scene.held import HeldObjects
 from openarm_motion.scene.map_view import FieldSource, MapState, MapView
 from openarm_motion.scene.planning_scene import PlanningScene
-from openarm_motion.service.context import PlanningContext
+from openarm_motion.service.claims import ArmClaims
+from openarm_motion.service.context import Around, PlanningContext
 from openarm_motion.service.coordination import ArmCoordination
 from openarm_motion.service.faults import PlanFaults
 from openarm_motion.service.lift import LiftMotions
@@ -150,8 +150,10 @@ class MotionService:
         self.coordination = ArmCoordination(robot, arms, self.memory, lambda: self.on_held())
         view = MapView(config.map, field, frames)
         self._context = PlanningContext(robot, arms, self.scene, self.memory, self.coordination, view, config)
-        self._claimed: set[str] = set()
-        lifted = (robot, arms, self._context, self.memory, self._claim) if isinstance(arms, LiftedArms) else None
+        self.claims = ArmClaims()
+        lifted = (
+            (robot, arms, self._context, self.memory, self.claims.holding) if isinstance(arms, LiftedArms) else None
+        )
         self._lift = LiftMotions(*lifted) if lifted else None
 
     # --- plans and motions
@@ -201,7 +203,7 @@ class MotionService:
             return await self._lift.move(goal, request, self._stopped(cancelled), answer)
         try:
             arm, stopped = self._arm(request.arm), self._stopped(cancelled)
-            with self._claim(arm.name, wanted=not request.plan_only):
+            with self.claims.holding(arm.name, wanted=not request.plan_only):
                 report("planning", 0.0)
                 held, holding = self.memory.on_request(arm.name, request.attached, request.hand_empty)
                 around = moves.RequestBoxes(request.obstacles, held)
@@ -232,7 +234,7 @@ class MotionService:
         answer = MoveArmsAnswer()
         try:
             arms, stopped = self._two_arms(request.targets), self._stopped(cancelled)
-            with self._claim(*(arm.name for arm in arms), wanted=not request.plan_only):
+            with self.claims.holding(*(arm.name for arm in arms), wanted=not request.plan_only):
                 report("planning", 0.0)
                 begin = self.robot.now()
                 held = [self.memory.on_request(t.arm, t.attached, t.hand_empty)[0] for t in request.targets]
@@ -277,7 +279,7 @@ class MotionService:
         try:
             arm = self._arm(request.arm)
             self.scene.require(request.scene_version)
-            with self._claim(arm.name, wanted=True):
+            with self.claims.holding(arm.name, wanted=True):
                 await self._context.fresh()
                 stopped = self._stopped(cancelled)
                 delay = await self._follow(arm, request.motion, stopped, report, request.max_start_delay)
@@ -319,6 +321,12 @@ class MotionService:
         prepared = self._context.prepare([arm], self._start(arm, state), 0.0, self._stopped(never), (), [held])
         now = _with(await self.robot.compute(prepared.complete), state)
         return arm, now, moves.RequestBoxes((), held)
+
+    async def around_all(self, seen: object = None) -> Around | None:
+        """Return what is around all arms; None where it is as when it was `Around.seen`. Raises as `surroundings`."""
+        self._follow_lift()
+        await self._context.fresh()
+        return self._context.around_all(seen)
 
     def compute_ik(self, arm_name: str, pose: Array, seed: Sequence[float], *, position_only: bool) -> IkAnswer:
         """Solve the inverse kinematics of an arm's tool.
@@ -481,20 +489,3 @@ class MotionService:
 
     def _stopped(self, cancelled: Callable[[], bool]) -> Callable[[], bool]:
         return lambda: self.closing or cancelled()
-
-    @contextmanager
-    def _claim(self, *names: str, wanted: bool) -> Generator[None, None, None]:
-        """Take arms for as long as this is open.
-
-        Raises:
-            OpenArmError: BUSY, when one of them is taken.
-        """
-        taken = [name for name in names if name in self._claimed]
-        if wanted and taken:
-            raise OpenArmError(Code.BUSY, f"the {taken[0]} arm is moving already; wait for the end, or cancel it first")
-        claimed = names if wanted else ()
-        self._claimed.update(claimed)
-        try:
-            yield
-        finally:
-            self._claimed.difference_update(claimed)

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 
-from openarm_control.pacing import RateDivider
+from openarm_common.pacing import RateDivider
 from openarm_sim_bridge.cameras.handover import CameraReport, CameraSetup, StateSender, pair
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.world.world import Snapshot, World

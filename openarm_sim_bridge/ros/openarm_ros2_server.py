@@ -12,10 +12,10 @@ from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from openarm_common.pacing import RateDivider
 from openarm_common.ros.convert import ns_to_stamp
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_control.follower import End
-from openarm_control.pacing import RateDivider
 from openarm_control.ros.trajectory_server import trajectory_of
 from openarm_control.trajectory import Trajectory, TrajectoryError, TrajectoryResult, checked
 from openarm_sim_bridge.openarm_ros2 import PositionController

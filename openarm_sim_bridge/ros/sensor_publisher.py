@@ -11,11 +11,11 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import Imu
 
+from openarm_common.pacing import RateDivider
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import ns_to_stamp, vector
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_common.types import Array
-from openarm_control.pacing import RateDivider
 from openarm_sim_bridge.world.world import World
 
 #: Rate at which subscribers are counted, Hz.

@@ -12,11 +12,11 @@ from openarm_interfaces.msg import ObjectState, ObjectStateArray
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
+from openarm_common.pacing import RateDivider
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, vector
 from openarm_common.ros.node import QOS_CLOCK, reliable
 from openarm_control.joints import JointReadout
-from openarm_control.pacing import RateDivider
 from openarm_control.ros.robot_publisher import RobotPublisher
 from openarm_sim_bridge.world.world import ObjectReadout, World
 

@@ -37,7 +37,7 @@ def test_every_program_of_the_library_does_what_it_should(start_graph: Any, robo
     up.stop()
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert [row for row in rows if not row["ok"]] == [], done.stderr[-2000:]
-    assert len(rows) == 15
+    assert len(rows) == 17
     assert done.returncode == 0
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from openarm_control.pacing import Pacer, PeriodMeter, RateDivider, RealTimeFactor
+from openarm_common.pacing import Pacer, PeriodMeter, RateDivider, RealTimeFactor
 
 MS = 1_000_000
 

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether courses of the arms keep clear: the planning scene, the map, the robot itself, as they were when it was made.
+
+Not for two threads at once. Configurations are those of all arms, one after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+
+from openarm_common.types import Array
+from openarm_motion.collision.exact import Clearance, Contact
+from openarm_motion.collision.fast import FastScene
+from openarm_motion.collision.line_checks import LineChecks
+from openarm_motion.collision.solids import Box
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.dual_arm import DualArm
+
+#: What is too near already may come nearer by this on a course, by rounding, m.
+_SLACK = 1e-4
+
+
+def _pair(contact: Contact) -> tuple[str, str]:
+    return contact.first, contact.second
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What is around the arms.
+
+    Attributes:
+        names: The arms, in the order of configurations.
+        exact: The exact layer.
+        fast: The fast layer, of the same distances.
+    """
+
+    names: tuple[str, ...]
+    exact: LineChecks
+    fast: FastScene
+    _asked: ExitStack
+
+    @classmethod
+    def of(
+        cls, arms: Sequence[Arm], now: StartState, held: Sequence[Sequence[Box]], clearance: Clearance, lag: float
+    ) -> Surroundings:
+        """Take what is around arms as it is in a state.
+
+        Args:
+            arms: One arm, or two.
+            now: Joints, planning scene and map.
+            held: What each arm holds, tool frame.
+            clearance: Distances to keep.
+            lag: Joints may be this far from where they are told to be, rad; what that moves is kept in addition.
+        """
+        environment = now.environment
+        if len(arms) == 2:
+            both, parts = DualArm(*arms), (held[0], held[1])
+            scene: LineChecks = both.scene(
+                now.state, (), clearance.arms, held=parts, environment=environment, clearance=clearance
+            )
+        else:
+            scene = arms[0].scene(now.state, (), held[0], environment=environment, clearance=clearance)
+        asked = ExitStack()
+        asked.enter_context(scene.further(lag * scene.swings().sum(axis=1)))
+        return cls(tuple(arm.name for arm in arms), scene, FastScene(scene.arms, scene.arms[0].distances), asked)
+
+    def joined(self, parts: Mapping[str, Array]) -> Array:
+        """Configurations (m, n) of all arms, of those (m, k) or (k,) of each."""
+        rows = max(len(np.atleast_2d(part)) for part in parts.values())
+        each = [np.broadcast_to(np.atleast_2d(parts[name]), (rows, parts[name].shape[-1])) for name in self.names]
+        return np.hstack(each)
+
+    def free(self, states: Array) -> bool:
+        """Whether configurations (m, n) are proven free; between two of a course lies less than the clearance."""
+        return bool(self.fast.free_many(states).all())
+
+    def no_nearer(self, path: Array) -> bool:
+        """Whether on configurations (m, n) nothing comes nearer than it may, or than it is at the first of them."""
+        before = {_pair(contact): contact.distance for contact in self.exact.contacts(path[0])}
+        for q in path[1:]:
+            for contact in self.exact.contacts(q):
+                allowed = before.get(_pair(contact))
+                if allowed is None or contact.distance < allowed - _SLACK:
+                    return False
+        return True
+
+    def contact(self, path: Array) -> Contact | None:
+        """The first pair on configurations (m, n) that is too near."""
+        return next((contacts[0] for q in path if (contacts := self.exact.contacts(q))), None)
