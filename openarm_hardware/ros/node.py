@@ -17,12 +17,12 @@ from openarm_common.collision.self_collision import SelfCollision
 from openarm_common.errors import OpenArmError
 from openarm_common.motors.bus import emulated_buses, open_bus
 from openarm_common.motors.wiring import Wiring, axes_of, load_wiring
+from openarm_common.pacing import RateDivider
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ArmLoad, ServoModel
 from openarm_common.ros.node import run, until_shutdown
 from openarm_control.controller import RobotController
 from openarm_control.joints import JointReadout, arm_groups, arm_loads, carriers, gripper_groups, joint_names
-from openarm_common.pacing import RateDivider
 from openarm_control.ros.controllers import Controllers
 from openarm_control.ros.process import ControlNode, timely
 from openarm_control.ros.robot_publisher import RobotPublisher

@@ -23,6 +23,8 @@ from openarm_motion.kinematics import chain_kernels as kernels
 
 #: Continuous joints have no limits; a seed and a search still need a range.
 _CONTINUOUS = np.pi
+#: Guesses for the nearest configuration to what is out of reach.
+_OUT_OF_REACH = 4
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,10 @@ class ArmKinematics:
         self.axes: Array = np.array(axes)
         self.prismatic: NDArray[np.bool_] = np.array(kinds)
         self.tip: Array = T
+        slides = np.where(self.prismatic, np.maximum(np.abs(self.lower), np.abs(self.upper)), 0.0)
+        offsets = np.linalg.norm([*self.placements[1:, :3, 3], T[:3, 3]], axis=1)
+        #: The tool is nowhere further than this from the origin of the first joint, m.
+        self.reach = float(offsets.sum() + slides.sum())
 
     @property
     def n(self) -> int:
@@ -129,6 +135,10 @@ class ArmKinematics:
     def fk_many(self, q: ArrayLike) -> Array:
         """Tool poses (m, 4, 4) of configurations (m, n)."""
         return kernels.forward_many(np.ascontiguousarray(q, dtype=np.float64), *self.chain)
+
+    def beyond(self, pose: Array, tolerance: float) -> bool:
+        """Whether a pose (4, 4) is certainly out of reach by more than a tolerance, m."""
+        return bool(np.linalg.norm(pose[:3, 3] - self.placements[0, :3, 3]) > self.reach + tolerance)
 
     def joint_axes(self, q: ArrayLike) -> tuple[Array, Array]:
         """A point on each joint axis and its direction, (n, 3) each, base frame."""
@@ -183,6 +193,8 @@ class ArmKinematics:
         middle = 0.5 * (self.lower + self.upper)
         first = middle if seed is None else np.asarray(seed, dtype=np.float64)
         best = np.empty(self.n)
+        if self.beyond(target, tolerance[0]):
+            restarts = min(restarts, _OUT_OF_REACH)
         success, error_p, error_r = kernels.solve_ik(
             np.ascontiguousarray(target, dtype=np.float64),
             np.ascontiguousarray(first),

@@ -22,6 +22,8 @@ _SAME = 0.05
 #: Guesses for several solutions of a numeric arm; random ones of a pose that the closed form finds nothing for.
 _GUESSES = 24
 _RESTARTS = 60
+#: The same where the closed form proves that it is out of reach by more than rounding, m.
+_OUT_OF_REACH, _ROUNDED = 4, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +159,8 @@ class InverseKinematics:
         arm = self.kinematics
         results = [arm.ik(pose, guess, margin=margin, restarts=0) for guess in miss.nearest]
         if not any(result.success for result in results):
-            results.append(arm.ik(pose, near, margin=margin, restarts=_RESTARTS))
+            restarts = _OUT_OF_REACH if abs(miss.too_far) > _ROUNDED else _RESTARTS
+            results.append(arm.ik(pose, near, margin=margin, restarts=restarts))
         best = min(results, key=lambda result: result.cost)
         return _Search([closed.classify(result.q) for result in results if result.success], best, miss)
 
@@ -170,8 +173,10 @@ class InverseKinematics:
 
     def _several(self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool) -> list[Solution]:
         """What a few guesses lead to, each once."""
-        rng = np.random.default_rng(0)
         arm = self.kinematics
+        if arm.beyond(pose, _ROUNDED):
+            return []
+        rng = np.random.default_rng(0)
         seeds = [] if near is None else [np.asarray(near, dtype=np.float64)]
         seeds += [0.5 * (arm.lower + arm.upper), *rng.uniform(arm.lower, arm.upper, (_GUESSES, arm.n))]
         found: list[Solution] = []

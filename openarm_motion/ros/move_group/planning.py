@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 PIPELINE = "openarm"
 #: Longest planning time, s.
 _LONGEST = 120.0
+#: A base on the border of a workspace is in it, m.
+_ROUNDED = 1e-6
 #: A joint state that names the present configuration to within this has no other one in mind, rad.
 _PRESENT = 1e-3
 
@@ -182,9 +184,12 @@ class Requests:
             raise OpenArmError(Code.INVALID_ARGUMENT, text)
 
     def _check_workspace(self, message: WorkspaceParameters) -> None:
-        """As in MoveIt a workspace bounds the base of a mobile robot; the arms of this one stand where they are."""
+        """As in MoveIt a workspace bounds the base of the robot, which stands where it is; zeros bound nothing."""
         low, high = xyz(message.min_corner), xyz(message.max_corner)
         if not np.isfinite([*low, *high]).all() or (low > high).any():
             text = f"workspace_parameters from {low.tolist()} to {high.tolist()} m, expected min_corner <= max_corner"
             raise OpenArmError(Code.INVALID_ARGUMENT, text)
-        self._convert.in_base(np.eye(4), message.header.frame_id)
+        base = se3.inverse(self._convert.in_base(np.eye(4), message.header.frame_id))[:3, 3]
+        if (low != high).any() and ((base < low - _ROUNDED) | (base > high + _ROUNDED)).any():
+            text = f"workspace_parameters from {low.tolist()} to {high.tolist()} m leave the robot's base out, which is"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{text} at {base.round(3).tolist()} m of their frame")
