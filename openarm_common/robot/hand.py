@@ -17,6 +17,9 @@ from pydantic import Field, model_validator
 from openarm_common.config import Config
 from openarm_common.types import Array
 
+#: Room that an open finger keeps to each side of what it goes around, m: the error of a pose.
+_ROOM = 0.005
+
 Length = Annotated[float, Field(ge=0.0, le=0.2)]
 
 
@@ -27,7 +30,6 @@ class HandParts(Config):
         fingers: [position of the finger joint, finger], from closed to open; linear between. m, or rad.
         tcp: [finger, how far the pads meet an object beyond the TCP link along its z], m; linear between.
         opening: Finger of a hand that is open for a grasp, m.
-        max_width: Widest side of an object that the pads take, m.
         tip_clearance: TCP above a surface so that the tips clear it, m.
         tip_clearance_tilted: Added times sin(tilt), m.
         pad_centre: Middle of the pads behind the TCP, m.
@@ -39,7 +41,6 @@ class HandParts(Config):
     fingers: tuple[tuple[float, float], ...] = Field(min_length=2)
     tcp: tuple[tuple[float, float], ...] = Field(default=((0.0, 0.0),), min_length=1)
     opening: float = Field(gt=0.0, le=0.1)
-    max_width: float = Field(gt=0.0, le=0.2)
     tip_clearance: Length
     tip_clearance_tilted: Length
     pad_centre: Length
@@ -55,6 +56,11 @@ class HandParts(Config):
         if not self.opening <= self.fingers[-1][1]:
             raise ValueError(f"opening {self.opening:g} m is beyond the last of fingers, {self.fingers[-1][1]:g} m")
         return self
+
+    @property
+    def max_width(self) -> float:
+        """Widest side of an object that the open hand has room around, m."""
+        return 2.0 * (self.opening - _ROOM)
 
     def tcp_shift(self, finger: float) -> float:
         """How far beyond the TCP link fingers meet an object, along its z, m."""

@@ -18,6 +18,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict
+from openarm_grasp.planning.candidates import Box
 
 #: A thing that rests as it rested is as high as before, m, or to this share of its height.
 _HEIGHT, _HEIGHT_SHARE = 0.008, 0.08
@@ -113,6 +114,28 @@ def judge_gone(
                 return CameraVerdict(Code.GRASP_MISSED, text)
     text = f", and is seen {highest * 1e3:.0f} mm higher" if highest else ""
     return CameraVerdict(Code.OK, f"the cluster has gone from its place{text}")
+
+
+def judge_held(held: Sequence[Box], points: Array, config: HeldConfig) -> CameraVerdict:
+    """Whether what hangs in the hand is where it was taken hold of: GRASP_LOST, when it has turned or slipped.
+
+    Args:
+        held: Boxes about the thing, where the hand should hold it, base frame.
+        points: (n, 3) of what is seen of it; none proves nothing.
+        config: Thresholds.
+    """
+    if not len(points) or not held:
+        return CameraVerdict(Code.OK, "the hand hides what it holds")
+    out = np.full(len(points), np.inf)
+    for box in held:
+        T = box.T_frame_box
+        beyond = np.maximum(np.abs((points - T[:3, 3]) @ T[:3, :3]) - 0.5 * box.size, 0.0)
+        out = np.minimum(out, np.linalg.norm(beyond, axis=1))
+    off, limit = 1e3 * float(np.percentile(out, _MOST)), 1e3 * config.askew
+    if off > limit:
+        text = f"it reaches {off:.0f} mm out of where the hand should hold it, expected at most {limit:.0f} mm"
+        return CameraVerdict(Code.GRASP_LOST, f"it has turned or slipped in the hand: {text}")
+    return CameraVerdict(Code.OK, "it is where the hand should hold it")
 
 
 def judge_unmoved(before: Array, now: Array, config: HeldConfig) -> tuple[bool, str]:

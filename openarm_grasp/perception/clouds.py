@@ -81,6 +81,28 @@ def cluster_frames(frames: Sequence[Frame], place: Array) -> tuple[ClusterFrame,
     return tuple(_clusters(frame, frame.cloud, place) for frame in frames if frame.cloud is not None)
 
 
+def risen_points(frames: Sequence[Frame], before: Cluster, rise: float) -> Array:
+    """Return the points (n, 3) of what the newest image shows over the place of a thing, higher than it stood.
+
+    Args:
+        frames: In the base frame.
+        before: The thing as it stood.
+        rise: Its upper end is at least this much higher, m.
+    """
+    frame = next((frame for frame in reversed(frames) if frame.cloud is not None), None)
+    found = [np.empty((0, 3))]
+    if frame is not None and frame.cloud is not None:
+        for number in range(1, len(frame.detections) + 1):
+            points = frame.cloud.points[frame.cloud.labels == number].astype(np.float64)
+            if len(points) < _LEAST_POINTS:
+                continue
+            now = Cluster.of(points)
+            away = float(np.linalg.norm(now.centroid[:2] - before.centroid[:2]))
+            if now.top - before.top >= rise and away <= 0.5 * (now.extent + before.extent):
+                found.append(points)
+    return np.concatenate(found)
+
+
 def _clusters(frame: Frame, cloud: LabelledCloud, place: Array) -> ClusterFrame:
     found: list[Cluster] = []
     for number, detection in enumerate(frame.detections, start=1):

@@ -11,7 +11,7 @@ opening axis is always horizontal, so both fingers close at one height and the o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from math import cos, hypot, radians, sin
 
@@ -32,6 +32,8 @@ _SIDE_WEIGHT = 0.15
 _ROOM_WEIGHT = 0.15
 #: More clearance of a finger than this is as good as this, m.
 _ROOM = 0.04
+#: Share of the straight lines that is left of shorter ones.
+_SHORT = 0.625
 #: Half of a finger's thickness, m.
 _FINGER = 0.010
 
@@ -69,6 +71,7 @@ class GraspCandidate:
             is `width`.
         patch_area: Of the smaller of both contact patches, m2; 0: not known.
         held: What is grasped, as boxes, base frame; empty: it is the box that was detected.
+        opened: Aperture of the hand on the approach and after the release, m; None: wide open.
     """
 
     id: str
@@ -82,6 +85,7 @@ class GraspCandidate:
     apertures: tuple[float, float] | None = None
     patch_area: float = 0.0
     held: tuple[Box, ...] = ()
+    opened: float | None = None
 
 
 @dataclass(frozen=True)
@@ -228,6 +232,16 @@ def propose(
             )
     # Stable sort: equal scores keep the order of the edges, so the same scene gives the same plan.
     return tuple(sorted(found, key=lambda c: -c.score))
+
+
+def shorter(candidate: GraspCandidate) -> GraspCandidate:
+    """The same grasp on shorter straight lines: near the end of an arm's reach longer ones leave it."""
+    return replace(
+        candidate,
+        id=f"{candidate.id}/short",
+        approach_offset=_SHORT * candidate.approach_offset,
+        retreat_offset=_SHORT * candidate.retreat_offset,
+    )
 
 
 def hold_of(candidate: GraspCandidate) -> str:

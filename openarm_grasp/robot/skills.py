@@ -235,10 +235,17 @@ class Skills:
         guard = still_held if carrying else None if line is None else on_line
         await self.robot.follow(arm, trajectory, f"{arm} arm: {what}", guard)
 
-    async def follow_and_grip(self, arm: str, trajectory: Trajectory, what: str, how: Literal["open", "close"]) -> None:
+    async def follow_and_grip(
+        self,
+        arm: str,
+        trajectory: Trajectory,
+        what: str,
+        how: Literal["open", "close"],
+        aperture: float | None = None,
+    ) -> None:
         """Follow a trajectory and move the fingers at the same time; arguments and errors as of `follow`, `open`."""
-        grip = self.open if how == "open" else self.close
-        await self.robot.together([lambda: grip(arm, how), lambda: self.follow(arm, trajectory, what)])
+        grip = (lambda: self.open(arm, how, aperture)) if how == "open" else (lambda: self.close(arm, how))
+        await self.robot.together([grip, lambda: self.follow(arm, trajectory, what)])
 
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Move the TCP to a pose on a straight line."""
@@ -326,24 +333,31 @@ class Skills:
         reader = self._hands[arm]
         return reader.finger() >= reader.hand.parts.opening - self._config.hand.open_tolerance
 
-    async def open(self, arm: str, what: str) -> None:
+    async def open(self, arm: str, what: str, aperture: float | None = None) -> None:
         """Open the hand.
 
         Args:
             arm: Whose hand.
             what: For errors, for example "release".
+            aperture: Distance between the fingers, m; None: wide open.
 
         Raises:
-            OpenArmError: EXECUTION_FAILED, when it does not open.
+            OpenArmError: EXECUTION_FAILED, when the fingers do not get there.
         """
         self.robot.check()
         reader, robot, what = self._hands[arm], self.robot, f"{arm} hand: {what}"
-        await robot.grip(arm, reader.joint, reader.hand.opened, what, 0.0)
+        finger = reader.hand.parts.opening if aperture is None else 0.5 * aperture
+        await robot.grip(arm, reader.joint, reader.hand.position(finger), what, 0.0)
         # The result may be here before the joint state that shows it.
         end_ns, limit = robot.now_ns + SPEED_WINDOW_NS, self._config.limits.answer_timeout
-        await robot.until(lambda: self.is_open(arm) or robot.now_ns > end_ns, limit, what)
-        if not self.is_open(arm):
-            reached = f"{reader.finger() * 1e3:.1f} mm of {reader.hand.parts.opening * 1e3:.0f} mm"
+
+        def there() -> bool:
+            off = reader.finger() - finger
+            return (off if aperture is None else -abs(off)) >= -self._config.hand.open_tolerance
+
+        await robot.until(lambda: there() or robot.now_ns > end_ns, limit, what)
+        if not there():
+            reached = f"{reader.finger() * 1e3:.1f} mm of {finger * 1e3:.0f} mm"
             raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers stopped at {reached}")
 
     async def close(self, arm: str, what: str, force: float = 0.0) -> None:

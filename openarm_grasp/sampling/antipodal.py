@@ -5,12 +5,14 @@ Two contacts hold an object by friction when the line between them lies in both 
 force-closure grasps", IJRR 1988). Pairs of such contacts are found by marching from the surface through the object;
 around each, hand poses turn about the closing axis and reach to several depths, and stay when the shape of the hand
 has room (ten Pas and Platt, "Using geometry to detect grasp poses in 3D point clouds", ISRR 2015). From coarse to fine:
-each pair first with an upright hand, then the best of them in all ways. The score weighs how much touches, how well
+each pair first with an upright hand, then the best of them in all ways; where the open hand has no room, one that is
+opened less, so that a finger goes into what is hollow. The score weighs how much touches, how well
 it faces the pads, how far the weight is from the pads, room, tilt, and how much of it was seen.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import acos, cos, radians
@@ -36,15 +38,17 @@ _WIDTHS = (0.012, 0.030, 0.055)
 _LEAN = 0.5
 #: Contact along the pad, 0 its upper end: upright hands first, then all.
 _FIRST_DEPTHS, _DEPTHS = (0.35, 0.8), (0.15, 0.4, 0.65, 0.9)
-#: Good poses of one pair, and of all.
-_PER_PAIR, _ENOUGH = 6, 300
+#: Good poses of one pair that lean alike, and of all.
+_PER_KIND, _ENOUGH = 2, 400
+#: Candidates whose hands are turned alike, within these angles: arms reach other turns, too.
+_ALIKE, _TURN = 6, radians(30.0)
 #: Candidates differ by a displacement of the TCP, m, or a turn.
 _APART, _TURNED = 0.008, radians(12.0)
 #: A pad that touches with this share of its area holds as well as one that touches with all.
 _TOUCH = 0.35
 #: Weights of the score; lengths m, angles rad.
 _WEIGHTS = {"contact": 1.5, "align": 10.0, "lever": -25.0, "aside": -10.0, "tilt": -0.8, "level": -0.8, "wide": -1.5,
-            "room": 0.3, "certainty": 1.0, "balance": -2.0, "unseen": -2.0}  # fmt: skip
+            "room": 0.3, "narrow": -1.0, "certainty": 1.0, "balance": -2.0, "unseen": -2.0}  # fmt: skip
 #: The weight may be this far from the pads before it counts, m.
 _LEVER = 0.005
 #: A width this near to the widest begins to count, m; alignments count from here.
@@ -67,6 +71,7 @@ class Antipodal:
         tilt: Of the approach from straight down, rad.
         score: The sum of `parts`.
         parts: What it is made of.
+        opened: Aperture of the hand on its approach, m; None: wide open.
     """
 
     T_base_tcp: Array
@@ -76,6 +81,7 @@ class Antipodal:
     tilt: float
     score: float
     parts: Mapping[str, float]
+    opened: float | None
 
 
 @dataclass(frozen=True)
@@ -114,9 +120,8 @@ class Search:
         self._surface, self._shape, self._config, self._approach = surface, shape, config, approach
         self._field = field
         step = surface.step
-        self._hand = np.ascontiguousarray(shape.points / step)
         self._pads, self._tips = shape.pads / step, shape.tips / step
-        self._widest = 2.0 * (shape.opening - config.margin) / step
+        self._widest = self._fits(shape)
         self._least_cos = cos(radians(config.cone_deg))
         self._why = np.zeros(len(_WHY), np.int64)
         self._pairs = np.empty((0, 8))
@@ -136,7 +141,7 @@ class Search:
         bound = self._bound(self._pairs)
         order = np.argsort(-bound, kind="stable")
         first = _hypotheses(order, (0.0,), _FIRST_DEPTHS, (1.0,))
-        upright = self._search(first, per_pair=1, enough=len(order))
+        upright = self._search(first, self._shape, per_kind=1, enough=len(order))
         expected = bound - _WEIGHTS["contact"] - _NOT_UPRIGHT
         if len(upright):
             expected[upright[:, kernels.PAIR].astype(int)] = self._scores(upright)[0]
@@ -144,7 +149,14 @@ class Search:
         rest = _hypotheses(np.arange(len(expected)), turns, _DEPTHS, (1.0, -1.0))
         hoped = expected[rest[:, 0].astype(int)] + _WEIGHTS["tilt"] * np.abs(rest[:, 1])
         rest = rest[np.argsort(-hoped, kind="stable")]
-        return self._ranked(np.concatenate([upright, self._search(rest, per_pair=_PER_PAIR, enough=_ENOUGH)]))
+        found = [upright, self._search(rest, self._shape, per_kind=_PER_KIND, enough=_ENOUGH)]
+        for shape in self._shape.narrower:
+            roomy = np.concatenate([rows[:, kernels.PAIR] for rows in found]).astype(int)
+            tight = self._pairs[:, 6] <= self._fits(shape)
+            tight[roomy] = False
+            one = rest[tight[rest[:, 0].astype(int)]]
+            found.append(self._search(one, shape, per_kind=_PER_KIND, enough=_ENOUGH))
+        return self._ranked(np.concatenate(found))
 
     def exhaustive(self) -> tuple[Antipodal, ...]:
         """Find grasps without the coarse stage: every pair in all ways; what `best` is compared with."""
@@ -152,27 +164,29 @@ class Search:
         self._pairs = self._find_pairs()
         turns = [sign * radians(t) for t in self._approach.tilts_deg for sign in ((1.0, -1.0) if t else (1.0,))]
         every = _hypotheses(np.arange(len(self._pairs)), turns, _DEPTHS, (1.0, -1.0))
-        return self._ranked(self._search(every, per_pair=len(every) + 1, enough=len(every)))
+        shapes = (self._shape, *self._shape.narrower)
+        found = [self._search(every, shape, per_kind=len(every) + 1, enough=len(every)) for shape in shapes]
+        return self._ranked(np.concatenate(found))
 
-    def near(self, poses: list[tuple[Array, float]]) -> tuple[Antipodal, ...]:
-        """Find grasps next to hand poses, best first.
+    def near(self, T_base_tcp: Array, width: float, opened: float | None) -> tuple[Antipodal, ...]:
+        """Find grasps next to a pose of the hand, best first.
 
         Args:
-            poses: T_base_tcp (4, 4) and width, m.
+            T_base_tcp: (4, 4).
+            width: Extent between the pads there, m.
+            opened: Aperture of the hand, m; None: wide open.
         """
-        rows: list[list[float]] = []
-        tries: list[tuple[float, float, float, float]] = []
-        for T, width in poses:
-            pad = self._shape.pads[int(np.abs(self._shape.fingers - 0.5 * width).argmin())]
-            middle = self._surface.voxel(T[:3, 3] + 0.5 * (pad[2] + pad[3]) * T[:3, 2])
-            down = np.array([0.0, 0.0, -1.0])
-            down -= (down @ T[:3, 1]) * T[:3, 1]
-            turn = acos(float(np.clip(down @ T[:3, 2] / max(float(np.linalg.norm(down)), 1e-9), -1.0, 1.0)))
-            turn *= 1.0 if float(np.cross(down, T[:3, 2]) @ T[:3, 1]) >= 0.0 else -1.0
-            tries += [(float(len(rows)), turn, depth, 1.0) for depth in (0.5, 0.35, 0.65, 0.2, 0.8)]
-            rows.append([*middle, *T[:3, 1], width / self._surface.step, 1.0])
-        self._pairs = np.array(rows, dtype=np.float64).reshape(-1, 8)
-        return self._ranked(self._search(np.array(tries).reshape(-1, 4), per_pair=2, enough=_ENOUGH))
+        T, every = T_base_tcp, (self._shape, *self._shape.narrower)
+        shape = self._shape if opened is None else min(every, key=lambda s: abs(2.0 * s.opening - opened))
+        pad = shape.pads[int(np.abs(shape.fingers - 0.5 * width).argmin())]
+        middle = self._surface.voxel(T[:3, 3] + 0.5 * (pad[2] + pad[3]) * T[:3, 2])
+        down = np.array([0.0, 0.0, -1.0])
+        down -= (down @ T[:3, 1]) * T[:3, 1]
+        turn = acos(float(np.clip(down @ T[:3, 2] / max(float(np.linalg.norm(down)), 1e-9), -1.0, 1.0)))
+        turn *= 1.0 if float(np.cross(down, T[:3, 2]) @ T[:3, 1]) >= 0.0 else -1.0
+        tries = np.array([(0.0, turn, depth, 1.0, 0.0) for depth in (0.5, 0.35, 0.65, 0.2, 0.8)])
+        self._pairs = np.array([[*middle, *T[:3, 1], width / self._surface.step, 1.0]])
+        return self._ranked(self._search(tries, shape, per_kind=2, enough=_ENOUGH))
 
     def _find_pairs(self) -> Array:
         """Pairs of contacts (p, 8), one of each kind."""
@@ -220,17 +234,22 @@ class Search:
         """How far widths (n,), voxels, are in the last part of what the hand takes, 0 to 1."""
         return np.maximum(1.0 - (self._widest - widths) * self._surface.step / _WIDE, 0.0)
 
-    def _search(self, hypotheses: Array, *, per_pair: int, enough: int) -> Array:
+    def _fits(self, shape: HandShape) -> float:
+        """Width that a hand has room around, voxels."""
+        return 2.0 * (shape.opening - self._config.margin) / self._surface.step
+
+    def _search(self, hypotheses: Array, shape: HandShape, *, per_kind: int, enough: int) -> Array:
+        """Rows of `found`, one a pose of a hand that has room; each hand may try so many poses."""
         surface, step = self._surface, self._surface.step
         found = np.zeros((enough, kernels.COLUMNS))
         if not len(hypotheses):
             return found[:0]
         count = kernels.search(
-            surface.cells, surface.obstacles, surface.normals, self._pairs, hypotheses, self._hand, self._pads,
-            self._tips, self._shape.opening / step, (self._shape.fingers[1] - self._shape.fingers[0]) / step,
+            surface.cells, surface.obstacles, surface.normals, self._pairs, hypotheses, shape.points / step, self._pads,
+            self._tips, shape.opening / step, (self._shape.fingers[1] - self._shape.fingers[0]) / step,
             self._config.table_clearance / step, self._approach.pregrasp_distance / step,
-            surface.voxel(surface.centroid), self._widest, self._least_cos, per_pair, enough, self._config.poses,
-            found, self._why,
+            surface.voxel(surface.centroid), self._fits(shape), self._least_cos, per_kind, enough,
+            int(self._why[0]) + self._config.poses, found, self._why,
         )  # fmt: skip
         self._good += count
         return found[:count]
@@ -247,6 +266,7 @@ class Search:
             "level": w["level"] * np.abs(found[:, 9]),
             "wide": w["wide"] * self._wide(found[:, k.WIDTH]),
             "room": w["room"] * (found[:, k.ROOM] - 1.0),
+            "narrow": w["narrow"] * (1.0 - found[:, k.OPENING] * step / self._shape.opening),
             "certainty": w["certainty"] * (found[:, k.SURE] - 1.0),
             "balance": w["balance"] * np.arctan(found[:, k.SLOPE]),
             "unseen": w["unseen"] * (found[:, k.BLIND] + found[:, k.UNSEEN] * step / _WIDE),
@@ -258,24 +278,36 @@ class Search:
         if not len(found):
             return ()
         found = found[np.argsort(-self._scores(found)[0], kind="stable")]
-        step, shape, surface = self._surface.step, self._shape, self._surface
+        step, surface = self._surface.step, self._surface
         apart = ranking_kernels.distinct(found, _APART / step, cos(_TURNED), len(found))
         found = found[apart]
         scores, parts = self._scores(found)
         seen = surface.middles(np.argwhere((surface.cells > 0) & (surface.cells < SHADOW)))
-        low, high = shape.points.min(axis=0), shape.points.max(axis=0)
+        shapes = {one.opening: one for one in (self._shape, *self._shape.narrower)}
         best: list[Antipodal] = []
+        rest: list[Antipodal] = []
+        alike: Counter[tuple[int, ...]] = Counter()
         for row in range(len(found)):
             T = np.eye(4)
             T[:3] = found[row, :12].reshape(3, 4)
             T[:3, 3] = surface.low + T[:3, 3] * step
-            R, p = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
-            if ranking_kernels.inside(seen, R, p, shape.planes, shape.starts, low, high) or not self._clear_of_map(T):
+            turned = tuple(int(v) for v in np.round(np.append(T[:2, 1], T[:2, 2]) / _TURN))
+            if alike[turned] >= _ALIKE and len(rest) == self._config.best:
                 continue
-            best.append(self._grasp(found[row], T, float(scores[row]), {n: float(v[row]) for n, v in parts.items()}))
+            R, p = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+            shape = shapes[min(shapes, key=lambda o: abs(o - float(found[row, kernels.OPENING]) * step))]
+            low, high = shape.points.min(axis=0), shape.points.max(axis=0)
+            if ranking_kernels.inside(seen, R, p, shape.planes, shape.starts, low, high):
+                continue
+            if not self._clear_of_map(T, shape):
+                continue
+            alike[turned] += 1
+            one = self._grasp(found[row], T, float(scores[row]), {n: float(v[row]) for n, v in parts.items()})
+            (best if alike[turned] <= _ALIKE else rest).append(one)
             if len(best) == self._config.best:
                 break
-        return tuple(best)
+        best += rest[: self._config.best - len(best)]
+        return tuple(sorted(best, key=lambda one: -one.score))
 
     def _grasp(self, row: Array, T: Array, score: float, parts: dict[str, float]) -> Antipodal:
         step, k = self._surface.step, kernels
@@ -285,14 +317,16 @@ class Search:
         # a voxel each way, and more at a side that was not seen; an object that turns in the hand gets narrower
         unsure = float(row[k.UNSEEN]) * step
         least = max((1.0 - _SLACK) * float(row[k.NARROW]) * step - 2.0 * step, 0.0)
-        most = min(width * (1.0 + _SLACK) + 2.0 * step + unsure, 2.0 * self._shape.opening)
-        return Antipodal(T, width, (least, most), area, float(row[k.TILT]), score, parts)
+        most = min(width * (1.0 + _SLACK) + 2.0 * step + unsure, 2.0 * float(row[k.OPENING]) * step)
+        finger = float(row[k.OPENING]) * step
+        opened = 2.0 * finger if finger < self._shape.opening - 1e-6 else None
+        return Antipodal(T, width, (least, most), area, float(row[k.TILT]), score, parts, opened)
 
-    def _clear_of_map(self, T: Array) -> bool:
+    def _clear_of_map(self, T: Array, shape: HandShape) -> bool:
         """Whether the hand keeps out of the cells of the map beyond the voxels of the surface."""
         if self._field is None:
             return True
-        points = self._shape.points @ T[:3, :3].T + T[:3, 3]
+        points = shape.points @ T[:3, :3].T + T[:3, 3]
         local = self._surface.voxel(points)[:, :2]
         beyond = ((local < 0.0) | (local >= self._surface.cells.shape[:2])).any(axis=1)
         return not bool((self._field.at(points[beyond]) < 0.87 * self._field.lattice.resolution).any())
@@ -304,6 +338,7 @@ def _hypotheses(
     depths: tuple[float, ...],
     signs: tuple[float, ...],
 ) -> Array:
-    """Every combination (n, 4) of pair, turn, depth and sign, pair by pair."""
+    """Every combination (n, 5) of pair, turn, depth and sign, pair by pair; kinds are pairs and turns."""
     grids = np.meshgrid(pairs, turns, depths, signs, indexing="ij")
-    return np.stack([grid.ravel() for grid in grids], axis=1).astype(np.float64)
+    kind = np.arange(len(pairs) * len(turns)).repeat(len(depths) * len(signs))
+    return np.column_stack([*(grid.ravel() for grid in grids), kind]).astype(np.float64)

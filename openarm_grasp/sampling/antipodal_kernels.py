@@ -34,9 +34,9 @@ _ROUNDING = 0.05
 _LEAST_TOUCH = 3.0
 
 #: Columns of `found`: pose (12), width, narrowest, touching share, alignment, certainty, how far unseen sides may reach
-#: out, slope of the line between the patches, lever, off the middle, tilt, in shadow, room, pair.
-COLUMNS = 25
-WIDTH, NARROW, TOUCH, ALIGN, SURE, UNSEEN, SLOPE, LEVER, ASIDE, TILT, BLIND, ROOM, PAIR = range(12, 25)
+#: out, slope of the line between the patches, lever, off the middle, tilt, in shadow, room, pair, finger of the hand.
+COLUMNS = 26
+WIDTH, NARROW, TOUCH, ALIGN, SURE, UNSEEN, SLOPE, LEVER, ASIDE, TILT, BLIND, ROOM, PAIR, OPENING = range(12, 26)
 
 
 @njit(cache=True, nogil=True)
@@ -302,7 +302,7 @@ def _frame(d: Array, angle: float, T: Array) -> bool:
 def search(
     cells: Bytes, obstacles: Bytes, normals: Floats, found_pairs: Array, hypotheses: Array, hand: Array, pads: Array,
     tips: Array, opening: float, finger_step: float, clearance: float, back: float, centre: Array, widest: float,
-    least_cos: float, per_pair: int, enough: int, most: int, found: Array, why: Ints,
+    least_cos: float, per_kind: int, enough: int, most: int, found: Array, why: Ints,
 ) -> int:  # fmt: skip
     """Try hand poses in their order until enough are good.
 
@@ -311,8 +311,8 @@ def search(
         obstacles: (nx, ny, nz) of the hand.
         normals: (nx, ny, nz, 3).
         found_pairs: (p, 8) of `pairs`.
-        hypotheses: (h, 4) pair, turn about the closing axis (rad), contact along the pad (0 upper end, 1 tip), sign of
-            the closing axis.
+        hypotheses: (h, 5) pair, turn about the closing axis (rad), contact along the pad (0 upper end, 1 tip), sign of
+            the closing axis, kind.
         hand: (n, 3) points of the open hand.
         pads: (m, 4) by finger.
         tips: (m, c, 3) by finger.
@@ -323,7 +323,7 @@ def search(
         centre: (3,) of mass.
         widest: Voxels.
         least_cos: Of the friction cone.
-        per_pair: Good poses of one pair.
+        per_kind: Good poses of one kind.
         enough: Good poses.
         most: Poses that are tried.
         found: (enough, COLUMNS), filled.
@@ -337,12 +337,12 @@ def search(
     T = np.eye(4)
     d, contact = np.empty(3), np.empty(COLUMNS)
     first, last = np.empty((_ACROSS, _ALONG)), np.empty((_ACROSS, _ALONG))
-    good = np.zeros(found_pairs.shape[0], np.int64)
+    good = np.zeros(int(hypotheses[:, 4].max()) + 1, np.int64)
     for h in range(hypotheses.shape[0]):
         if count == enough or why[0] == most:
             break
-        p = int(hypotheses[h, 0])
-        if good[p] >= per_pair:
+        p, kind = int(hypotheses[h, 0]), int(hypotheses[h, 4])
+        if good[kind] >= per_kind:
             continue
         why[0] += 1
         pair, sign = found_pairs[p], hypotheses[h, 3]
@@ -458,7 +458,7 @@ def search(
         out[LEVER] = abs(rx * T[1, 1] - ry * T[0, 1]) / level
         out[ASIDE] = abs(rx * T[0, 1] + ry * T[1, 1]) / level
         out[TILT] = math.acos(min(1.0, -T[2, 2]))
-        out[BLIND], out[ROOM], out[PAIR] = blind / hand.shape[0], room, p
-        good[p] += 1
+        out[BLIND], out[ROOM], out[PAIR], out[OPENING] = blind / hand.shape[0], room, p, opening
+        good[kind] += 1
         count += 1
     return count

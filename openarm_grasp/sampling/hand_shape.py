@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shape of an open hand and of its pads, from the robot's description: what a grasp needs room for.
 
+Where a wide open hand has no room, such as inside of what is hollow, one that is opened less may have it.
+
 It is made of the collision shapes of all links beyond the last joint of the arm, and of the housings of the cameras
 that they carry, at their calibrated mounts. All lengths are m, in the frame of the tool centre point: z out of the
 fingers, y the opening direction.
@@ -27,6 +29,8 @@ _FINE, _COARSE = 0.005, 0.008
 _STEPS = 12
 #: A part of a finger is pad where it is this near to where pads are.
 _PAD = 0.002
+#: Hands that are opened less: shares of the opening.
+_NARROWER = (0.7, 0.45, 0.25)
 #: Rays that measure the inner side of a finger are so far apart, from this far behind the TCP to beyond it.
 _RAY, _BEHIND, _BEYOND = 0.0015, 0.06, 0.02
 #: Deeper in a piece is inside, m.
@@ -40,13 +44,14 @@ class HandShape:
     """One arm's hand.
 
     Attributes:
-        opening: Finger of the hand that is open for a grasp, m.
+        opening: Finger of the hand that is opened so, m.
         fingers: (m,) fingers at which `pads` and `tips` are known, ascending.
         pads: (m, 4) of the pads: least and greatest x, least and greatest z.
         tips: (m, 16, 3) corners of boxes about the ends of both fingers.
         points: (n, 3) of the surface of the open hand, the foremost first.
         planes: (k, 4) of the convex pieces of the open hand: inside where normal · p + offset <= 0.
         starts: (pieces + 1,) where the planes of each piece begin.
+        narrower: The same hand opened less, widest first.
     """
 
     opening: float
@@ -56,6 +61,7 @@ class HandShape:
     points: Array
     planes: Array
     starts: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    narrower: tuple[HandShape, ...] = ()
 
     @classmethod
     def of(cls, robot: RobotDescription, arm: str, cameras: Iterable[CameraConfig] = ()) -> HandShape:
@@ -69,30 +75,10 @@ class HandShape:
         Raises:
             OpenArmError: CONFIG_INVALID, when the robot has no hand, or its fingers no shape or no pads.
         """
-        hand = robot.hand(arm)
-        opened = _pieces(robot, arm, hand.opened)
-        fingers = [corners for link, corners in opened if link in robot.arm(arm).fingers]
-        if not fingers:
-            text = f"the fingers of arm {arm!r} of robot {robot.name!r} have no collision shapes: grasps need them"
-            raise OpenArmError(Code.CONFIG_INVALID, text)
-        rest = [corners for link, corners in opened if link not in robot.arm(arm).fingers]
-        rest += _housings(robot, arm, cameras)
-        steps = np.linspace(0.0, hand.parts.opening, _STEPS)
-        pads, tips = np.empty((_STEPS, 4)), np.empty((_STEPS, 16, 3))
-        for n, finger in enumerate(steps):
-            both = [c for link, c in _pieces(robot, arm, hand.position(finger)) if link in robot.arm(arm).fingers]
-            pads[n] = _pad(both, float(finger), f"arm {arm!r} of robot {robot.name!r}")
-            tips[n] = _ends(both)
-        pieces = [ConvexHull(corners) for corners in (*fingers, *rest)]
-        points = np.concatenate(
-            [_surface(hull, _FINE if n < len(fingers) else _COARSE) for n, hull in enumerate(pieces)]
-        )
-        equations = [np.unique(hull.equations.round(9), axis=0) for hull in pieces]
-        starts = np.cumsum([0, *(len(e) for e in equations)]).astype(np.int64)
-        shape = cls(hand.parts.opening, steps, pads, tips, points, np.concatenate(equations), starts)
-        # what is inside of another piece is no surface; the foremost points meet things first
-        points = points[shape.holds(points) < _INSIDE]
-        return replace(shape, points=np.ascontiguousarray(points[np.argsort(-points[:, 2], kind="stable")]))
+        opening = robot.hand(arm).parts.opening
+        pads, housings = _pads(robot, arm), _housings(robot, arm, cameras)
+        shapes = [_opened(robot, arm, share * opening, pads, housings) for share in (1.0, *_NARROWER)]
+        return replace(shapes[0], narrower=tuple(shapes[1:]))
 
     @property
     def reach(self) -> float:
@@ -104,6 +90,52 @@ class HandShape:
         values = points @ self.planes[:, :3].T + self.planes[:, 3]
         deepest = [-values[:, a:b].max(axis=1) for a, b in zip(self.starts[:-1], self.starts[1:], strict=True)]
         return np.asarray(np.max(deepest, axis=0), dtype=np.float64)
+
+
+def _pads(robot: RobotDescription, arm: str) -> tuple[Array, Array, Array]:
+    """Return `fingers`, `pads` and `tips` of a hand.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when its fingers have no pads.
+    """
+    hand = robot.hand(arm)
+    steps = np.linspace(0.0, hand.parts.opening, _STEPS)
+    pads, tips = np.empty((_STEPS, 4)), np.empty((_STEPS, 16, 3))
+    for n, finger in enumerate(steps):
+        both = _fingers(robot, arm, _pieces(robot, arm, hand.position(finger)))
+        pads[n] = _pad(both, float(finger), f"arm {arm!r} of robot {robot.name!r}")
+        tips[n] = _ends(both)
+    return steps, pads, tips
+
+
+def _opened(
+    robot: RobotDescription, arm: str, opening: float, pads: tuple[Array, Array, Array], housings: list[Array]
+) -> HandShape:
+    """Shape of a hand whose finger is at `opening`, m."""
+    every = _pieces(robot, arm, robot.hand(arm).position(opening))
+    fingers = _fingers(robot, arm, every)
+    rest = [corners for link, corners in every if link not in robot.arm(arm).fingers]
+    pieces = [ConvexHull(corners) for corners in (*fingers, *rest, *housings)]
+    points = np.concatenate([_surface(hull, _FINE if n < len(fingers) else _COARSE) for n, hull in enumerate(pieces)])
+    equations = [np.unique(hull.equations.round(9), axis=0) for hull in pieces]
+    starts = np.cumsum([0, *(len(e) for e in equations)]).astype(np.int64)
+    shape = HandShape(opening, *pads, points, np.concatenate(equations), starts)
+    # what is inside of another piece is no surface; the foremost points meet things first
+    points = points[shape.holds(points) < _INSIDE]
+    return replace(shape, points=np.ascontiguousarray(points[np.argsort(-points[:, 2], kind="stable")]))
+
+
+def _fingers(robot: RobotDescription, arm: str, pieces: list[tuple[str, Array]]) -> list[Array]:
+    """Corners of the shapes of fingers among those of a hand.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when there are none.
+    """
+    fingers = [corners for link, corners in pieces if link in robot.arm(arm).fingers]
+    if not fingers:
+        text = f"the fingers of arm {arm!r} of robot {robot.name!r} have no collision shapes: grasps need them"
+        raise OpenArmError(Code.CONFIG_INVALID, text)
+    return fingers
 
 
 def _pieces(robot: RobotDescription, arm: str, position: float) -> list[tuple[str, Array]]:

@@ -9,11 +9,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import degrees, hypot, sin
+from math import degrees, hypot, radians, sin
 from typing import Any, Protocol
 
 import numpy as np
 
+from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.distance_field import DistanceField
@@ -29,6 +30,8 @@ from openarm_grasp.sampling.surface import Surface
 
 #: Leaning away from the shoulder reaches furthest; as of the grasps of boxes.
 _SIDE_WEIGHT = 0.15
+#: A grasp that is searched anew at the second look is this near to the one before it, m, rad.
+_AROUND, _TURNED = 0.03, radians(30.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,24 +148,36 @@ def make_sampler(name: str) -> GraspSampler:
     return found()
 
 
-def refine(candidates: Sequence[GraspCandidate], asked: Sampling) -> tuple[GraspCandidate, ...]:
-    """Rank candidates again on a surface that has seen more: a second look by the camera on the hand.
+def refine(candidate: GraspCandidate, asked: Sampling) -> tuple[GraspCandidate, ...]:
+    """Correct a candidate on a surface that has seen more: a second look by the camera on the hand.
 
-    Each is moved to where the surface now is between the fingers; those that it no longer has room for are left out.
+    It is moved to where the surface now is between the fingers; where the hand has no room for that, others near it
+    are searched.
 
     Args:
-        candidates: Best first; those that were planned for the hand where it is now.
+        candidate: That the hand is before now.
         asked: With the surface that all views were fused into.
 
     Returns:
-        Candidates near the given ones, best first; empty when none is left.
+        Candidates near it, best first; empty when the hand has no room.
 
     Raises:
         OpenArmError: NOT_READY, without a surface or a shape of the hand.
     """
     search, surface = _search(asked)
-    found = search.near([(c.T_base_tcp, c.width) for c in candidates])
-    return _candidates(found, asked, surface)
+    found = search.near(candidate.T_base_tcp, candidate.width, candidate.opened)
+    return _candidates(found or _around(candidate, search.best()), asked, surface)
+
+
+def _around(candidate: GraspCandidate, found: Sequence[Antipodal]) -> tuple[Antipodal, ...]:
+    """Those that a hand before the candidate reaches by a small motion."""
+    T = candidate.T_base_tcp
+    return tuple(
+        one
+        for one in found
+        if float(np.linalg.norm(one.T_base_tcp[:3, 3] - T[:3, 3])) <= _AROUND
+        and se3.angle_between(one.T_base_tcp[:3, :3], T[:3, :3]) <= _TURNED
+    )
 
 
 def _search(asked: Sampling) -> tuple[Search, Surface]:
@@ -210,6 +225,7 @@ def _candidates(found: Sequence[Antipodal], asked: Sampling, surface: Surface) -
                 apertures=one.apertures,
                 patch_area=one.patch_area,
                 held=held,
+                opened=one.opened,
             )
         )
     ranked.sort(key=lambda c: -c.score)

@@ -15,7 +15,7 @@ from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Frame, Sighting, UntrustedError, in_view, on_table
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.arms import out_of_reach
-from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
+from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, shorter
 from openarm_grasp.planning.options import NoWayError, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets
 from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
@@ -47,7 +47,7 @@ async def find_grasp(run: Run, why: str) -> tuple[Grasp, Planned | None, str]:
     while True:
         sighting = await detect(run, why)
         if run.kept is not None:
-            grasp = _grasp(run, run.kept.arm, sighting, run.kept.candidate)
+            grasp = grasp_of(run, run.kept.arm, sighting, run.kept.candidate)
             grasp = run.grasp = replace(grasp, closed=run.kept.closed)
             why = f"the {grasp.arm} hand holds {run.label!r}; {len(grasp.places)} ways to place it"
             if run.request.dry_run:
@@ -168,13 +168,18 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
     arms = retries.arms_to_try(arms, run.failed)
     ways = {arm: run.ways(arm, sighting) for arm in arms}
     where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
-    for repeats, run.arm in product((False, True), arms):
+    for short, repeats, run.arm in product((False, True), (False, True), arms):
         offered = ways[run.arm].repeats if repeats else ways[run.arm].fresh
+        if short:
+            refused = run.findings.refusals.get(run.arm)
+            far = refused is not None and refused.code is Code.UNREACHABLE and not run.findings.place_refused
+            offered = tuple(shorter(one) for one in offered) if far else ()
         if not offered:
             continue
         run.options |= options_of(run.arm, offered, target, run.config.approach)
         text = f"{why}; trying the {run.arm} arm" if why else f"{target.label!r} stands at {where}"
         text += f"; {len(offered)} ways to grasp it" + ("; all that is left has failed before" if repeats else "")
+        text += " on shorter lines" if short else ""
         try:
             return await _plan_with(run, sighting, offered, text)
         except NoGraspError as error:
@@ -213,7 +218,7 @@ async def _plan_with(
         run.options = planned(run.options, arm, offered, found.chosen, found.refusals, found.limit_margins)
         candidate = offered[found.chosen]
         # Also without a place that is asked for: no free spot is a reason not to lift.
-        grasp = run.grasp = _grasp(run, arm, sighting, candidate)
+        grasp = run.grasp = grasp_of(run, arm, sighting, candidate)
         chosen = f"grasp {candidate.id} with the {arm} arm"
         if request.place is None and not (request.dry_run or (request.confirm and request.phase == "all")):
             return grasp, found, chosen
@@ -239,7 +244,7 @@ async def _plan_with(
         return grasp, found, f"{chosen}, place {run.place_target}"
 
 
-def _grasp(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) -> Grasp:
+def grasp_of(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) -> Grasp:
     """A grasp with the ways to put the object down: where it was asked for, or on free spots."""
     request, target, others, table = run.request, sighting.target, sighting.others, run.context.table
     if request.place is not None:

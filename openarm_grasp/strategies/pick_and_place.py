@@ -18,11 +18,11 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
-from openarm_grasp.evidence.shapes import judge_gone, judge_rests, judge_unmoved
+from openarm_grasp.evidence.shapes import judge_gone, judge_held, judge_rests, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
-from openarm_grasp.perception.clouds import cluster_frames, cluster_of, object_points, points_near
+from openarm_grasp.perception.clouds import cluster_frames, cluster_of, object_points, points_near, risen_points
 from openarm_grasp.perception.detections import SAME_PLACE, Frame, apart
-from openarm_grasp.planning.candidates import PlaceTarget
+from openarm_grasp.planning.candidates import PlaceTarget, held_boxes
 from openarm_grasp.planning.place import place_targets, placing_error
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.requests.states import Hand, State, check_transition
@@ -155,7 +155,7 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
     camera = run.context.looks.get(arm, "")
     if camera:
         robot.expect_near(camera)
-    await robot.follow_and_grip(arm, plan.transfer, what, "open")
+    await robot.follow_and_grip(arm, plan.transfer, what, "open", grasp.candidate.opened)
     why = "the open hand is before the object"
     if camera:
         grasp, plan, why = await _correct(run, grasp, plan, camera)
@@ -269,10 +269,15 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
     frames = (await robot.observe(_LIFT_FRAMES)).frames
     gripper = grasp.judge(evidence, config.held, was_held=True)
     if grasp.of_cloud:
-        place = sighting.target.p_base
-        camera = judge_gone(
-            cluster_of(sighting), cluster_frames(frames, place), config.held, match_radius=config.detect.match_radius
-        )
+        place, before, radius = sighting.target.p_base, cluster_of(sighting), config.detect.match_radius
+        camera = judge_gone(before, cluster_frames(frames, place), config.held, match_radius=radius)
+        if camera.ok:
+            T = robot.T_base_tcp(arm)
+            held = [
+                replace(b, T_frame_box=T @ b.T_frame_box) for b in held_boxes(sighting.target, grasp.candidate, config)
+            ]
+            where = judge_held(held, risen_points(frames, before, config.held.rise), config.held)
+            camera = camera if where.ok else where
     else:
         camera = verdicts.judge_sight(
             sighting.target,
@@ -334,7 +339,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
             raise OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}")
         run.enter(State.PLACE, gripper.reason)
         await robot.follow(arm, plan.approach, "put down", carrying=True)
-        await robot.open(arm, "release")
+        await robot.open(arm, "release", grasp.candidate.opened)
     except OpenArmError as error:
         if error.code is Code.GRASP_LOST:
             run.hand = Hand.FREE
@@ -346,6 +351,8 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
     try:
         await robot.wait(config.timing.after_release)
         await robot.follow(arm, plan.retreat, "leave")
+        if grasp.candidate.opened is not None:
+            await robot.open(arm, "open")
     except OpenArmError as error:
         reraise_stop(error)
         reason = error.message

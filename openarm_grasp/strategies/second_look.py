@@ -14,6 +14,7 @@ from openarm_grasp.planning import retries
 from openarm_grasp.robot.interface import Frames
 from openarm_grasp.robot.skills import reraise_stop
 from openarm_grasp.sampling.samplers import refine
+from openarm_grasp.strategies.find import grasp_of
 
 if TYPE_CHECKING:
     from openarm_grasp.requests.task import Grasp
@@ -74,11 +75,12 @@ def _shape_again(run: Run, grasp: Grasp, seen: Frames) -> Grasp:
     """
     near = _found(run, grasp, seen).clouds
     sighting = replace(grasp.sighting, clouds=(*grasp.sighting.clouds, *near))
-    refined = refine((grasp.candidate,), run.asked(grasp.arm, sighting))
+    refined = refine(grasp.candidate, run.asked(grasp.arm, sighting))
     if not near or not refined:
         what = "has no room for the grasp" if near else "shows too little of it"
         raise OpenArmError(Code.NOTHING_DETECTED, f"the surface seen from there {what}")
-    return replace(grasp, candidate=replace(refined[0], id=grasp.candidate.id))
+    candidate = replace(refined[0], id=grasp.candidate.id)
+    return grasp_of(run, grasp.arm, grasp.sighting, candidate)  # the hand stands elsewhere at the place, too
 
 
 def _found(run: Run, grasp: Grasp, seen: Frames) -> Sighting:

@@ -14,7 +14,6 @@ from openarm_common.robot.hand import Hand, HandParts
 
 MEASURES = {
     "opening": 0.04,
-    "max_width": 0.07,
     "tip_clearance": 0.012,
     "tip_clearance_tilted": 0.018,
     "pad_centre": 0.017,

@@ -292,8 +292,10 @@ class World(Skills):
     def lifted(self, label: str) -> None:
         self.objects.pop(label)
 
-    async def follow_and_grip(self, arm: str, trajectory: object, what: str, how: str) -> None:
-        await self._grip(arm, HAND.opening if how == "open" else 0.0, how)
+    async def follow_and_grip(
+        self, arm: str, trajectory: object, what: str, how: str, aperture: float | None = None
+    ) -> None:
+        await (self.open(arm, how, aperture) if how == "open" else self.close(arm, how))
         await self.follow(arm, trajectory, what)
 
     async def move_linear(self, arm: str, T_base_tcp: np.ndarray, what: str) -> None:
@@ -313,8 +315,8 @@ class World(Skills):
     def is_open(self, arm: str) -> bool:
         return self.gap >= 2.0 * (HAND.opening - self._config.hand.open_tolerance)
 
-    async def open(self, arm: str, what: str) -> None:
-        await self._grip(arm, HAND.opening, what)
+    async def open(self, arm: str, what: str, aperture: float | None = None) -> None:
+        await self._grip(arm, HAND.opening if aperture is None else 0.5 * aperture, what)
 
     async def close(self, arm: str, what: str, force: float = 0.0) -> None:
         await self._grip(arm, 0.0, what)

@@ -50,11 +50,12 @@ def test_an_object_turned_and_moved_gives_the_grasps_turned_and_moved(yaw, x, y)
 def test_no_hand_is_in_what_was_seen_and_no_grasp_is_wider_than_the_hand(size, yaw, slanted, neighbour):
     part, other = box(size, yaw=yaw), box((0.03, 0.03, 0.10), x=0.27 + neighbour, y=-0.2 - neighbour)
     surface = surface_of([part], SLANTED if slanted else ABOVE, [other])
-    shape = hand()
+    shapes = {2.0 * one.opening: one for one in hand().narrower} | {None: hand()}
     everything = surface.middles(np.argwhere((surface.cells >= SEEN) & (surface.cells <= OTHER)))
     for grasp in grasps(surface):
         assert 0.0 < grasp.width < APERTURE
         assert grasp.apertures[0] <= grasp.width <= grasp.apertures[1] <= APERTURE
+        shape = shapes[grasp.opened]
         assert shape.holds(se3.apply(se3.inverse(grasp.T_base_tcp), everything)).max(initial=-1.0) <= 0.0
         assert se3.apply(grasp.T_base_tcp, shape.points)[:, 2].min() >= TABLE_Z
         assert se3.is_pose(grasp.T_base_tcp)
@@ -135,3 +136,20 @@ def test_a_second_view_is_worth_more_certainty():
     sure_one = max(g.parts["certainty"] for g in grasps(one))
     sure_two = max(g.parts["certainty"] for g in grasps(two))
     assert sure_two >= sure_one
+
+
+@pytest.mark.requirement("R-16")
+def test_a_wall_is_held_by_a_hand_that_is_opened_less_where_an_open_one_meets_the_wall_beyond():
+    walls = [box((0.012, 0.10, 0.06), x=0.27 + side * 0.030) for side in (-1.0, 1.0)]
+    found = [one for one in grasps(surface_of(walls)) if abs(one.T_base_tcp[0, 1]) > 0.9 and one.width < 0.03]
+    assert found
+    for one in found:
+        assert one.opened is not None
+        assert one.width + 0.008 <= one.opened < 0.08
+        assert one.apertures[0] <= 0.012 <= one.apertures[1] <= one.opened
+
+
+def test_candidates_lean_in_many_ways_so_that_an_arm_finds_one_that_it_reaches():
+    found = grasps(surface_of([box((0.03, 0.09, 0.08))]))
+    leans = {(round(2.0 * one.T_base_tcp[0, 2]), round(2.0 * one.T_base_tcp[1, 2])) for one in found}
+    assert len(leans) >= 5

@@ -165,8 +165,8 @@ def test_the_steps_around_what_is_round_are_a_parameter():
 
 
 def test_something_round_and_too_wide_is_refused():
-    with pytest.raises(OpenArmError, match="80 mm × 80 mm") as error:
-        propose(can(width=0.08), CONFIG, HAND)
+    with pytest.raises(OpenArmError, match="85 mm × 85 mm") as error:
+        propose(can(width=0.085), CONFIG, HAND)
     assert error.value.code is Code.TOO_WIDE
 
 
@@ -209,14 +209,14 @@ def test_only_the_narrow_edge_of_a_wide_box_is_grasped():
 @pytest.mark.requirement("B-17")
 def test_too_wide_states_widths_and_limit():
     with pytest.raises(OpenArmError) as error:
-        propose(box(size=(0.08, 0.09, 0.05)), CONFIG, HAND)
+        propose(box(size=(0.085, 0.09, 0.05)), CONFIG, HAND)
     assert error.value.code is Code.TOO_WIDE
-    assert "80 mm × 90 mm" in error.value.message
-    assert "70 mm" in error.value.message
+    assert "85 mm × 90 mm" in error.value.message
+    assert "78 mm" in error.value.message
 
 
-def test_a_70_mm_side_measured_a_millimetre_too_wide_is_still_grasped():
-    assert propose(box(size=(0.071, 0.071, 0.05)), CONFIG, HAND)
+def test_a_78_mm_side_measured_a_millimetre_too_wide_is_still_grasped():
+    assert propose(box(size=(0.079, 0.079, 0.05)), CONFIG, HAND)
 
 
 def test_target_box_ends_above_the_table_and_at_the_top():

@@ -61,7 +61,7 @@ def test_the_answer_has_every_way_with_its_score_and_its_fate(asked) -> None:
 
 def test_a_refusal_names_every_way(asked) -> None:
     refused = no_way(Code.UNREACHABLE, **{"red_x+_tilt0": "20 mm short"})
-    found = by_id(asked(refused, refused))
+    found = by_id(asked(refused, refused, refused, refused))
     assert (found["red/x+/tilt0"].code, found["red/x+/tilt0"].message) == (Code.UNREACHABLE, "20 mm short")
 
 
@@ -70,7 +70,7 @@ def test_an_edge_that_is_too_wide_is_reported(asked) -> None:
     assert len(found) == 15
     assert (found["red/y"].code, found["red/y"].message) == (
         Code.TOO_WIDE,
-        "90 mm wide; the hand grasps sides up to 70 mm",
+        "90 mm wide; the hand grasps sides up to 78 mm",
     )
 
 

@@ -30,9 +30,9 @@ def test_a_grasp_goes_through_all_states_in_order(world):
 def test_the_hand_opens_on_the_way_to_the_pregrasp(world):
     real, together = world.follow_and_grip, []
 
-    async def follow_and_grip(arm, trajectory, what, how):
+    async def follow_and_grip(arm, trajectory, what, how, aperture):
         together.append((trajectory, how))
-        await real(arm, trajectory, what, how)
+        await real(arm, trajectory, what, how, aperture)
 
     world.follow_and_grip = follow_and_grip
     world.grasp()
@@ -208,7 +208,7 @@ def test_too_wide_is_refused_with_width_and_limit(worlds, box):
     outcome = worlds(box("red", 0.26, -0.2, size=0.09)).grasp()
     assert outcome.code is Code.TOO_WIDE
     assert "90 mm" in outcome.message
-    assert "70 mm" in outcome.message
+    assert "78 mm" in outcome.message
 
 
 # --- planning
@@ -226,7 +226,8 @@ def test_out_of_reach_names_the_reason_and_the_nearest_arm(world):
     outcome = world.grasp()
     assert outcome.code is Code.UNREACHABLE
     assert "right arm gets within 200 mm" in outcome.message
-    assert len(world.done(PlanGrasp)) == 2  # plan_attempts
+    assert len(world.done(PlanGrasp)) == 4  # plan_attempts, each also on shorter lines
+    assert {one.candidates[0].id.endswith("/short") for one in world.done(PlanGrasp)} == {False, True}
     assert outcome.attempts == 0
 
 

@@ -12,10 +12,10 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.evidence.shapes import Cluster, ClusterFrame, judge_gone, judge_rests
+from openarm_grasp.evidence.shapes import Cluster, ClusterFrame, judge_gone, judge_held, judge_rests
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.candidates import GraspCandidate
+from openarm_grasp.planning.candidates import Box, GraspCandidate
 from openarm_grasp.requests.task import Grasp
 
 HELD = HeldConfig()
@@ -145,3 +145,13 @@ def test_a_grasp_judges_its_hand_by_its_interval_and_by_how_far_it_had_closed():
     assert closed.judge(gap(0.040), HELD, was_held=True).code is Code.GRASP_LOST
     box = replace(grasp, candidate=replace(candidate, apertures=None))
     assert box.judge(gap(0.04), HELD).code is Code.HAND_COLLISION
+
+
+@pytest.mark.requirement("R-16")
+@pytest.mark.parametrize(("turn", "code"), [(0.0, Code.OK), (0.1, Code.OK), (0.5, Code.GRASP_LOST)])
+def test_a_long_thing_that_turns_about_the_fingers_is_lost(turn, code):
+    along = np.linspace(0.0, 0.2, 81)
+    points = np.stack([along * np.cos(turn), np.zeros(81), -along * np.sin(turn)], axis=1)
+    held = (Box("target/long", se3.make(p=(0.1, 0.0, 0.0)), np.array([0.2, 0.03, 0.02])),)
+    assert judge_held(held, points, HELD).code is code
+    assert judge_held(held, points[:0], HELD).ok  # what the hand hides proves nothing

@@ -96,7 +96,7 @@ def _unknown(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _too_wide(task: Task, rng: np.random.Generator) -> Task:
-    edge = round(float(rng.uniform(0.078, 0.10)), 3)
+    edge = round(float(rng.uniform(0.084, 0.10)), 3)
     wide = _target(task).model_copy(update={"shape": "box", "size": (edge, edge, 0.06)})
     return replace(task, scene=_objects(task, wide), codes=(Code.TOO_WIDE,))
 
