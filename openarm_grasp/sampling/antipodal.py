@@ -121,7 +121,7 @@ class Search:
         self._field = field
         step = surface.step
         self._pads, self._tips = shape.pads / step, shape.tips / step
-        self._widest = self._fits(shape)
+        self._widest, self._obstacles = self._fits(shape), surface.obstacles
         self._least_cos = cos(radians(config.cone_deg))
         self._why = np.zeros(len(_WHY), np.int64)
         self._pairs = np.empty((0, 8))
@@ -134,7 +134,17 @@ class Search:
         return Tried(len(self._pairs), int(self._why[0]), self._good, why)
 
     def best(self) -> tuple[Antipodal, ...]:
-        """Find grasps, best first; the same for the same surface."""
+        """Find grasps, best first; the same for the same surface.
+
+        Where the hand has no room for any with a voxel to spare, those are searched that have none.
+        """
+        found = self._best()
+        if not found and len(self._pairs):
+            self._obstacles = self._surface.tight
+            found = self._best()
+        return found
+
+    def _best(self) -> tuple[Antipodal, ...]:
         self._pairs = self._find_pairs()
         if not len(self._pairs):
             return ()
@@ -245,7 +255,7 @@ class Search:
         if not len(hypotheses):
             return found[:0]
         count = kernels.search(
-            surface.cells, surface.obstacles, surface.normals, self._pairs, hypotheses, shape.points / step, self._pads,
+            surface.cells, self._obstacles, surface.normals, self._pairs, hypotheses, shape.points / step, self._pads,
             self._tips, shape.opening / step, (self._shape.fingers[1] - self._shape.fingers[0]) / step,
             self._config.table_clearance / step, self._approach.pregrasp_distance / step,
             surface.voxel(surface.centroid), self._fits(shape), self._least_cos, per_kind, enough,

@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array, Bytes, Floats
 from openarm_grasp.sampling import voxel_kernels as kernels
-from openarm_grasp.sampling.voxel_kernels import FILLED, FREE, HIDDEN, SEEN, SHADOW
+from openarm_grasp.sampling.voxel_kernels import FILLED, FREE, HIDDEN, OTHER, SEEN, SHADOW
 
 #: Edge of a voxel, m.
 VOXEL = 0.0025
@@ -99,6 +99,13 @@ class Surface:
     def top(self) -> float:
         """Height of the highest voxel of the target, m."""
         return float(self.solid[:, 2].max()) + 0.5 * self.step
+
+    @cached_property
+    def tight(self) -> Bytes:
+        """Obstacles (nx, ny, nz) as `obstacles`, but no larger than what was seen."""
+        meaning = np.zeros(HIDDEN + 1, np.uint8)
+        meaning[[SEEN, FILLED, OTHER, SHADOW, HIDDEN]] = 1, 1, 1, 2, 3
+        return np.asarray(meaning[self.cells])
 
     def middles(self, index: Array | np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Array:
         """Middles (n, 3) of voxels (n, 3)."""
