@@ -29,7 +29,7 @@ from openarm_grasp.requests.states import Hand, State, check_transition
 from openarm_grasp.requests.task import Grasp, Placed, Status, Task
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import reraise_stop
-from openarm_grasp.strategies.find import agreed, find_grasp, plan_place
+from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place
 from openarm_grasp.strategies.retreat import retreat, still_held
 from openarm_grasp.strategies.run import Run
 from openarm_grasp.strategies.second_look import second_look
@@ -191,6 +191,8 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[
     corrected, why = await second_look(run, grasp, camera, least)
     if corrected is None:
         return grasp, plan, why
+    if grasp.of_cloud:  # held elsewhere, so that the hand stands elsewhere at the place
+        corrected = grasp_of(run, grasp.arm, corrected.sighting, corrected.candidate)
     run.findings.sighting, run.offered = corrected.sighting, (corrected.candidate,)
     run.enter(State.MOVE_TO_PREGRASP, f"{why}; correcting")
     robot.stop_observing()

@@ -14,7 +14,6 @@ from openarm_grasp.planning import retries
 from openarm_grasp.robot.interface import Frames
 from openarm_grasp.robot.skills import reraise_stop
 from openarm_grasp.sampling.samplers import refine
-from openarm_grasp.strategies.find import grasp_of
 
 if TYPE_CHECKING:
     from openarm_grasp.requests.task import Grasp
@@ -79,8 +78,7 @@ def _shape_again(run: Run, grasp: Grasp, seen: Frames) -> Grasp:
     if not near or not refined:
         what = "has no room for the grasp" if near else "shows too little of it"
         raise OpenArmError(Code.NOTHING_DETECTED, f"the surface seen from there {what}")
-    candidate = replace(refined[0], id=grasp.candidate.id)
-    return grasp_of(run, grasp.arm, grasp.sighting, candidate)  # the hand stands elsewhere at the place, too
+    return replace(grasp, candidate=replace(refined[0], id=grasp.candidate.id))
 
 
 def _found(run: Run, grasp: Grasp, seen: Frames) -> Sighting:
