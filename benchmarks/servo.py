@@ -6,7 +6,7 @@
 Starts the graph `motion`. For each seed the arms go to a posture, bodies are put around their tools, and each arm gets
 commands at 100 Hz at up to full speed that change every 0.3 to 1.5 s: twists in the base frame, twists in the tool
 frame, joint velocities; and straight at the table, at the other arm, into stretched postures. Every few seconds
-commands cease. Printed are:
+commands cease, after half a second of a steady joint velocity. Printed are:
 
     contacts    joint states in which the arms overlap the table, a body, the other arm or themselves, by exact
                 geometry of the collision shapes (states 10 ms apart)
@@ -56,7 +56,7 @@ from openarm_motion.ros.client import MotionClient
 from openarm_motion.service.motion_service import make_arms, table_box
 from openarm_motion.servo.twist import joint_velocities
 
-_SCENE, _PERIOD, _PAUSE = "demo", 0.01, 0.6
+_SCENE, _PERIOD, _PAUSE, _STEADY = "demo", 0.01, 0.6, 0.5
 _POSTURES = ("hands_up", "ready")
 _TOUCH = Clearance(own=0.0, world=0.0, arms=0.0, hand=0.0, touch=0.0, rest=0.0)
 
@@ -261,7 +261,8 @@ class Bench:
                 due += _PAUSE
             else:
                 for name, arm in arms.items():
-                    command = scripts[name].at(t, self._q(arm))
+                    before_pause = t >= pause_at - _STEADY and not plain
+                    command = _steady(arm, self._q(arm)) if before_pause else scripts[name].at(t, self._q(arm))
                     if plain:
                         q[name] = _plain_step(arm, q[name], command)
                     else:
@@ -276,6 +277,13 @@ class Bench:
 
     def _q(self, arm: Arm) -> Array:
         return np.array([self._jogger.latest[name] for name in arm.names])
+
+
+def _steady(arm: Arm, q: Array) -> Jog:
+    """The last joint towards its middle, so that stops are measured from a steady speed."""
+    joints = np.zeros(arm.kinematics.n)
+    joints[-1] = np.sign(0.5 * (arm.lower + arm.upper)[-1] - q[-1]) * 0.6
+    return Jog(joints=joints)
 
 
 def _plain_step(arm: Arm, q: Array, command: Jog) -> Array:

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node servo_node next to the motion node, with a fake robot: what it refuses, and who owns an arm."""
+
+from __future__ import annotations
+
+import pytest
+from control_msgs.msg import JointJog
+from geometry_msgs.msg import TwistStamped
+from moveit_msgs.msg import ServoStatus
+from moveit_msgs.srv import ServoCommandType
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+pytestmark = pytest.mark.requirement("R-29")
+
+JOINTS = ("openarm_right_joint1", "openarm_right_joint2")
+
+
+class Client:
+    """Publishes commands, and hears statuses and trajectories."""
+
+    def __init__(self, bench, prefix: str = "") -> None:
+        self.bench, self.ros, self.node = bench, bench.ros, bench.ros.node
+        self.name = f"{prefix}/servo_node"
+        self.said: list[ServoStatus] = []
+        self.told: list[JointTrajectory] = []
+        self.twists = self.node.create_publisher(TwistStamped, f"{self.name}/delta_twist_cmds", 10)
+        self.jogs = self.node.create_publisher(JointJog, f"{self.name}/delta_joint_cmds", 10)
+        self.node.create_subscription(ServoStatus, f"{self.name}/status", self.said.append, 10)
+        topic = "/right_joint_trajectory_controller/joint_trajectory"
+        self.node.create_subscription(JointTrajectory, topic, self.told.append, 10)
+
+    def call(self, kind, name: str, request=None):
+        return self.ros.call(self.node.create_client(kind, f"{self.name}/{name}"), request or kind.Request(), 30.0)
+
+    def send(self, message, done) -> None:
+        """Send a message again and again until something is so."""
+        publisher = self.twists if isinstance(message, TwistStamped) else self.jogs
+
+        def ask() -> bool:
+            publisher.publish(message)
+            return done()
+
+        self.ros.spin_until(ask, 10.0, "an answer")
+
+    def refusal(self, message) -> str:
+        """The sentence with which a message is refused."""
+        self.said.clear()
+        self.send(message, lambda: any(one.code == ServoStatus.INVALID for one in self.said))
+        return next(one.message for one in self.said if one.code == ServoStatus.INVALID)
+
+
+def twist(frame: str = "", z: float = 0.1) -> TwistStamped:
+    message = TwistStamped()
+    message.header.frame_id, message.twist.linear.z = frame, z
+    return message
+
+
+@pytest.fixture
+def client(bench) -> Client:
+    return Client(bench)
+
+
+def test_commands_are_refused_before_start_and_after_stop(client: Client) -> None:
+    jog = JointJog(joint_names=list(JOINTS), velocities=[0.1, 0.0])
+    assert "call start_servo" in client.refusal(jog)
+    assert client.call(Trigger, "start_servo").success
+    client.send(jog, lambda: bool(client.told))
+    assert client.told[-1].points[-1].velocities == pytest.approx([0.0] * 7)
+    assert client.call(SetBool, "pause_servo", SetBool.Request(data=True)).success
+    assert "call start_servo" in client.refusal(jog)
+
+
+@pytest.mark.parametrize(
+    ("message", "named"),
+    [
+        (JointJog(joint_names=list(JOINTS), velocities=[0.1]), "2 joint_names and 1 velocities"),
+        (JointJog(joint_names=["elbow"], velocities=[0.1]), "elbow"),
+        (JointJog(joint_names=[JOINTS[0], "openarm_left_joint1"], velocities=[0.1, 0.1]), "one arm"),
+        (JointJog(joint_names=[JOINTS[0]] * 2, velocities=[0.1, 0.1]), "different joints"),
+        (JointJog(joint_names=[JOINTS[0]], velocities=[float("nan")]), "nan"),
+        (JointJog(joint_names=[JOINTS[0]], velocities=[1.5]), "-1 to 1"),
+        (JointJog(joint_names=[JOINTS[0]], velocities=[0.1], displacements=[0.1]), "displacements"),
+        (JointJog(joint_names=[JOINTS[0]], velocities=[0.1], duration=1.0), "duration"),
+        (twist("openarm_right_hand_tcp", float("inf")), "inf"),
+        (twist("nowhere"), "nowhere"),
+        (twist(), "says no arm"),
+    ],
+)
+def test_a_command_that_makes_no_sense_is_refused_by_name(client: Client, message, named: str) -> None:
+    assert client.call(Trigger, "start_servo").success
+    assert named in client.refusal(message)
+
+
+def test_an_unknown_frame_is_refused_on_the_topic_of_an_arm(bench) -> None:
+    client = Client(bench, "/right")
+    assert client.call(Trigger, "start_servo").success
+    assert "nowhere" in client.refusal(twist("nowhere"))
+
+
+def test_a_type_that_was_switched_to_is_the_only_one(client: Client) -> None:
+    assert client.call(Trigger, "start_servo").success
+    kind = ServoCommandType.Request
+    assert not client.call(ServoCommandType, "switch_command_type", kind(command_type=kind.POSE)).success
+    assert client.call(ServoCommandType, "switch_command_type", kind(command_type=kind.JOINT_JOG)).success
+    assert "switch_command_type" in client.refusal(twist("openarm_right_hand_tcp"))
+
+
+def test_an_arm_that_a_goal_moves_is_not_servoed(client: Client) -> None:
+    service = client.bench.node.service
+    assert client.call(Trigger, "start_servo").success
+    with service.claims.holding("right", wanted=True):
+        assert "moving already" in client.refusal(JointJog(joint_names=[JOINTS[0]], velocities=[0.1]))
