@@ -245,16 +245,20 @@ def _with_misfit(linear: Linear, noise: Noise) -> Noise:
     return replace(noise, translation=translation, rotation=rotation, misfit=misfit)
 
 
-def information_at(problem: Problem, X: Array, Z: Array, noise: Noise) -> Array:
-    """Information (parameters, parameters) on the mounts at given mounts: its inverse is the Cramér-Rao bound.
+def information_at(
+    problem: Problem, X: Array, Z: Array, noise: Noise, extras: Sequence[Extra] = (), priors: Priors = FREE
+) -> Array:
+    """Information (parameters, parameters) on the unknowns at given mounts: its inverse is the Cramér-Rao bound.
 
     Args:
         problem: The views.
         X: (cameras, 4, 4).
         Z: (boards, 4, 4).
         noise: Standard deviations.
+        extras: More unknowns, at their usual values.
+        priors: Of these.
     """
-    return eliminate(linearise(problem, State.start(problem, X, Z), ()), noise)[0]
+    return eliminate(linearise(problem, State.start(problem, X, Z), extras, priors), noise)[0]
 
 
 def _stepped(problem: Problem, state: State, step: Array, correction: Array, extras: Sequence[Extra]) -> State:

@@ -3,7 +3,8 @@
 
 Postures are drawn in joint space, at random and around those that showed the board, so that each is reachable; kept are
 those in which all of the board would be in the image, large enough and not behind the robot; and of these the ones that
-take most off the predicted error of the camera's mount, with what both mounts are known to by now (twelve unknowns).
+take most off the predicted error of the camera's mount, with what both mounts are known to by now (twelve unknowns);
+where poses are for `calibrate zeros`, off that of the zeros of the joints too, which are then unknowns like the mounts.
 Whether a path leads there is decided by the planner. m, rad, px.
 """
 
@@ -18,8 +19,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from openarm_calibration.board.board import Board
+from openarm_calibration.handeye.kinematics import Posture
 from openarm_calibration.handeye.observability import UNITS, motion
-from openarm_calibration.handeye.problem import View, assemble, project
+from openarm_calibration.handeye.problem import Extra, View, assemble, project
 from openarm_calibration.handeye.refine import information_at, mount_error
 from openarm_calibration.handeye.robust import SolveConfig, solve_robustly
 from openarm_calibration.handeye.transforms import inverses
@@ -112,6 +114,9 @@ class SearchConfig(Config):
     px: float = Field(default=0.1, gt=0.0, description="spread of a mark that poses are chosen for, px")
     robot_translation: float = Field(default=1e-4, gt=0.0, description="spread of the robot, m")
     robot_rotation: float = Field(default=2e-4, gt=0.0, description="spread of the robot, rad")
+    zeros: float = Field(
+        default=0.0, ge=0.0, le=0.3, description="deviation of joint zeros that poses are to tell too, rad; 0: none"
+    )
     seed: int = Field(default=1, ge=0, description="of random postures")
 
 
@@ -310,17 +315,33 @@ class PoseSearch:
         X_all, Z_all = self.belief.X[None], Z[None]
         wide = np.array([config.mount_translation] * 3 + [config.mount_rotation] * 3)
         # of the board nothing is taken for granted: a metre and a radian
-        before: Array = np.diag(np.concatenate([wide, np.ones(6)]) ** -2.0)
+        deviations = np.concatenate([wide, np.ones(6), np.full(len(samples.joint_names), config.zeros)])
+        extras: tuple[Extra, ...] = ("zeros",) if config.zeros else ()
+        before: Array = np.diag(deviations[: None if extras else 12] ** -2.0)
         if len(samples):
-            before = before + information_at(samples.problem(), X_all, Z_all, noise)
+            before = before + information_at(samples.problem(), X_all, Z_all, noise, extras)
+        kinematics = samples.kinematics(samples.joint_names)
         out: list[tuple[float, Array]] = []
         for q, T in found:
-            pixels = project(board.points, board.radius, T, row)
-            view = View(board.points, pixels, samples.pose(_joints(samples, q)), samples.head.setup, board.radius)
-            gain = information_at(assemble([view], [optics], [T]), X_all, Z_all, noise)
-            variance = np.diag(invert_scaled(before + gain))[:6]
-            out.append((float(np.sum(variance / UNITS**2)), q))
+            pixels, at = project(board.points, board.radius, T, row), _joints(samples, q)
+            view = View(
+                board.points, pixels, samples.pose(at), samples.head.setup, board.radius, arm=Posture(kinematics, at)
+            )
+            gain = information_at(assemble([view], [optics], [T]), X_all, Z_all, noise, extras)
+            out.append((_left(invert_scaled(before + gain)), q))
         return out
+
+
+def _left(covariance: Array) -> float:
+    """Return how much error is left, as a score: of the mounts (12, 12), or of mounts and zeros (12 + joints, …).
+
+    Of the camera's mount the sum of its variances. With zeros, some of which a mount takes up whatever the poses are,
+    the geometric mean of the variances along all axes of the ellipsoid (D-optimal).
+    """
+    if len(covariance) == 12:
+        return float(np.sum(np.diag(covariance)[:6] / UNITS**2))
+    asked = np.r_[0:6, 12 : len(covariance)]
+    return float(np.exp(np.linalg.slogdet(covariance[np.ix_(asked, asked)])[1] / len(asked)))
 
 
 def _joints(samples: SampleSet, q: Array) -> dict[str, float]:

@@ -13,7 +13,7 @@ from openarm_calibration.board.detect import BoardDetection
 from openarm_calibration.handeye.observability import UNITS
 from openarm_calibration.handeye.problem import project
 from openarm_calibration.handeye.refine import information_at, mount_error
-from openarm_calibration.handeye.unknowns import Noise
+from openarm_calibration.handeye.unknowns import Noise, Priors
 from openarm_calibration.sampling.next_pose import PoseSearch, SearchConfig, advice
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3
@@ -46,9 +46,11 @@ class Arm:
         for side in ("left", "right"):
             self.state |= self.description.group_state(f"{side}_arm", "home")
 
-    def search(self) -> PoseSearch:
+    def search(self, zeros: float = 0.0) -> PoseSearch:
         given = self.Z @ se3.make(se3.rot_x(0.03), (0.008, -0.006, 0.0))
-        return PoseSearch(self.description, self.camera.T_parent_optical, given, QUICK)
+        return PoseSearch(
+            self.description, self.camera.T_parent_optical, given, QUICK.model_copy(update={"zeros": zeros})
+        )
 
     def look(self, q: np.ndarray, rng: np.random.Generator) -> bool:
         """Go there and take a sample; False when not all marks are in the image."""
@@ -149,6 +151,27 @@ def test_the_proposed_pose_is_more_informative_than_others_that_show_the_board(n
             with_one.append(score(other))
     assert len(with_one) >= 20
     assert with_one[0] < 0.95 * np.mean(with_one[1:])
+
+
+@pytest.mark.requirement("R-11")
+def test_poses_that_are_chosen_for_joint_zeros_tell_them_better() -> None:
+    """Eight poses of each kind: the deviation that is left of the zeros which no mount takes up, by the true mounts."""
+    left = {}
+    for zeros in (0.0, 0.02):
+        arm, rng = Arm("overhead"), np.random.default_rng(0)
+        search = arm.search(zeros)
+        while len(arm.samples) < 8:
+            proposal = search.propose(arm.samples, arm.state)[0]
+            if arm.look(proposal, rng):
+                search.learn(arm.samples)
+            else:
+                search.refuse(proposal)
+        noise, X, Z = Noise(0.05, 1e-4, 2e-4), arm.X[None], arm.Z[None]
+        joints = len(arm.samples.joint_names)
+        priors = Priors(zeros=np.full(joints, 0.02))
+        information = information_at(arm.samples.problem(), X, Z, noise, ("zeros",), priors)
+        left[zeros] = math.sqrt(np.sum(np.diag(np.linalg.inv(information))[1 - joints : -1]))
+    assert left[0.02] < 0.9 * left[0.0], left
 
 
 @pytest.mark.requirement("N-07")
