@@ -257,7 +257,7 @@ class Programs:
     def servo_jog(self) -> str:
         """Turn the last joint away from its nearest limit."""
         self.wait(lambda: self.arm.joint_state is not None)
-        state = self.arm.joint_state
+        state: Any = self.arm.joint_state
         last = self.names["joint_names"][-1]
         speed = -0.5 if state.position[list(state.name).index(last)] > 0.0 else 0.5
         return self.servoed(lambda servo: servo.servo_jog((last,), (speed,)))
