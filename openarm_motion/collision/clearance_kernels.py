@@ -3,7 +3,7 @@
 
 The answer "apart" is a proof while the answer "near" may be wrong. Shapes are boxes, cylinders, spheres and convex
 hulls on bodies. Body 0 is the base, bodies 1..n follow the joints. Shapes of one body are a cluster with a ball about
-it, and a hull where all are meshes, which is asked first; two clusters whose shapes are to be checked are a group. m,
+it, and a hull or box, which is asked first; two clusters whose shapes are to be checked are a group. m,
 rad, base frame. The kernels release the GIL.
 """
 
@@ -46,7 +46,7 @@ class Model(NamedTuple):
         clusters: (c,) body of each cluster; those that move come first.
         centres: (c, 3) of the ball about a cluster, in its body.
         bounds: (c,) radius of that ball.
-        hulls: (c,) a shape that holds all of the cluster, -1 without one.
+        hulls: (c,) a shape that holds all of the cluster.
         runs: (moving clusters + 1,) where the groups of each moving cluster with clusters at rest begin.
         groups: (g, 6) clusters a (moving) and b, the first and last + 1 of their pairs, b's shape if it is one
             at rest, else -1, and the last body that carries both; groups of two moving clusters come last.

@@ -34,6 +34,8 @@ _ROUNDING = 1e-6
 _CELL = 0.045
 #: Of one cell, with nothing near to it.
 _NO_CORNERS = np.empty((0, 3))
+#: Corners of a box of half edges 1.
+_SIGNS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _NO_MAP = DistanceMap(np.full((1, 1, 1), np.inf, np.float32), np.zeros(3), 1.0, np.inf)
 
 
@@ -267,20 +269,45 @@ class _Packer:
         return out, of
 
     def _cluster_hulls(self, clusters: Sequence[_Cluster], of: Mapping[int, int]) -> NDArray[np.int64]:
-        """(c,) the shape that holds all of each cluster: its only one, the hull of several meshes; -1 without one."""
+        """Return, by cluster, the shape that holds all of it: its only one, the hull of rigid meshes, or a box.
+
+        Fingers and what they hold get a box, since they are somewhere else in each query.
+        """
         members: list[list[int]] = [[] for _ in clusters]
         for k, cluster in of.items():
             members[cluster].append(k)
         out = np.full(len(clusters), -1, np.int64)
         for c, shapes in enumerate(members):
+            out[c] = len(self._kinds)
             if len(shapes) == 1:
                 out[c] = shapes[0]
             elif all(k in self._rigid for k in shapes):
                 meshes, poses = zip(*(self._rigid[k] for k in shapes), strict=True)
                 hull = _joined(meshes, np.array(poses).tobytes())
-                out[c] = len(self._kinds)
                 self._put(HULL, hull.half, clusters[c].body, se3.make(None, hull.centre), hull)
+            else:
+                half, T = self._box_about(shapes)
+                self._put(BOX, half, clusters[c].body, T)
         return out
+
+    def _box_about(self, shapes: Sequence[int]) -> tuple[Array, Array]:
+        """Return half edges (3,) and pose (4, 4) of the smallest box about shapes that is parallel to one of them."""
+        points = np.concatenate([self._corners(k) @ self._poses[k][:, :3].T + self._poses[k][:, 3] for k in shapes])
+        found: list[tuple[float, Array, Array]] = []
+        for R in {self._poses[k][:, :3].round(6).tobytes(): self._poses[k][:, :3] for k in shapes}.values():
+            turned = points @ R
+            low, high = turned.min(axis=0), turned.max(axis=0)
+            found.append((float(np.prod(high - low)), 0.5 * (high - low), se3.make(R, R @ (0.5 * (low + high)))))
+        _, half, T = min(found, key=lambda item: item[0])
+        return half, T
+
+    def _corners(self, k: int) -> Array:
+        """Return points (m, 3) whose hull holds a shape, in its frame."""
+        hull, size = self._hulls[k], self._sizes[k]
+        if hull is not None:
+            return hull.corners
+        half = {SPHERE: size[[0, 0, 0]], BOX: size}.get(self._kinds[k], size[[0, 0, 1]])
+        return half * _SIGNS
 
     def _groups(
         self, of: dict[int, int], clusters: list[_Cluster], parents: Sequence[int]

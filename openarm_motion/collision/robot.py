@@ -149,12 +149,21 @@ class CollisionRobot:
         return tuple(links), tuple(solids)
 
     def _enabled(self, description: RobotDescription) -> Iterable[tuple[int, int]]:
-        """Pairs of shapes to check, of which at least one moves."""
+        """Pairs of shapes to check, of which at least one moves; fingers of a hand are no matter of its arm."""
         bodies, moving = Bodies.of(description), set(self.moving)
+        carriers = [self._carrier(shape.parentJoint) for shape in self.geometry.geometryObjects]
         for i in self.moving:
             for j, link in enumerate(self.links):
-                if not (j in moving and j <= i) and bodies.checked(self.links[i], link):
+                if j in moving and (j <= i or carriers[j] == carriers[i]):
+                    continue
+                if bodies.checked(self.links[i], link):
                     yield i, j
+
+    def _carrier(self, joint: int) -> int:
+        """Return the last joint of the arm that a joint of the model hangs on, or which it is; 0 without one."""
+        while joint > 0 and joint not in self.joints:
+            joint = self.model.parents[joint]
+        return joint
 
     def _pairs_to_check(
         self, description: RobotDescription

@@ -35,14 +35,19 @@ def test_every_reachable_pose_is_solved(robot: tuple[Arm, np.ndarray]) -> None:
 
 
 @pytest.mark.requirement("B-13")
-def test_the_fast_layer_is_never_more_generous(robot: tuple[Arm, np.ndarray]) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_the_fast_layer_is_never_more_generous(robot: tuple[Arm, np.ndarray], share: float) -> None:
+    """Wherever the fingers are, and with something in them."""
     arm, _ = robot
-    exact = arm.scene({}, [box_from("post", (0.45, 0.1, 0.4), (0.1, 0.1, 0.8))])
+    (hand,) = arm.description.hands.values()
+    state = {hand.joint: hand.closed + share * (hand.opened - hand.closed)}
+    held = [box_from("thing", (0.0, 0.0, 0.03), (0.03, 0.02, 0.08))]
+    exact = arm.scene(state, [box_from("post", (0.45, 0.1, 0.4), (0.1, 0.1, 0.8))], held)
     states = np.random.default_rng(14).uniform(arm.kinematics.lower, arm.kinematics.upper, (1000, arm.kinematics.n))
     free = FastScene([exact]).free_many(states)
     truth = np.array([not exact.collides(q) for q in states])
     assert not np.any(free & ~truth)
-    assert int(np.sum(free)) > 0.9 * int(np.sum(truth)) > 300
+    assert int(np.sum(free)) > 0.9 * int(np.sum(truth)) > 250
 
 
 @pytest.mark.requirement("B-07")
