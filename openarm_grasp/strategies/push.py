@@ -135,7 +135,7 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
     for arm in sorted(robot.description.arm_names, key=lambda arm: arm == taker):
         ways = push_ways(found.target, end, config, closed_hand(robot.description, arm), task.context.hand)
         if not ways:
-            faults.append(f"{arm} hand: {found.target.label!r} would tip over")
+            faults.append(f"{arm} hand: {found.target.label!r} is too thin for it, or would tip over")
             continue
         try:
             plan = await robot.plan_grasp(arm, ways, found)
@@ -270,9 +270,10 @@ def push_ways(
         tilt = radians(tilt_deg)
         R = se3.rotation_from_z_y(sin(tilt) * heading - cos(tilt) * UP, y_tool)
         height = tips_height(tilt, measures)
-        front, low = _front(hand @ R.T, ahead, half_width, (-height, tall - height))
-        if low + height > 0.5 * tall:
+        met = _front(hand @ R.T, ahead, half_width, (-height, tall - height))
+        if met is None or met[1] + height > 0.5 * tall:
             continue
+        front, _ = met
         p = target.p_base - (half + front + config.push.gap) * ahead
         p[2] = target.bottom + height
         found.append(
@@ -308,8 +309,10 @@ def closed_hand(description: RobotDescription, arm: str) -> Array:
     return np.vstack(found)
 
 
-def _front(points: Array, ahead: Array, half_width: float, height: tuple[float, float]) -> tuple[float, float]:
+def _front(points: Array, ahead: Array, half_width: float, height: tuple[float, float]) -> tuple[float, float] | None:
     """How far the parts of the hand that can meet the object reach ahead of the TCP, and how low the foremost does, m.
+
+    None: the hand goes over what is so thin.
 
     Args:
         points: (n, 3) of the hand's surface, axes of the base, from the TCP.
@@ -320,6 +323,8 @@ def _front(points: Array, ahead: Array, half_width: float, height: tuple[float, 
     across = np.abs(points @ np.cross(UP, ahead))
     low, high = height
     meets = points[(across <= half_width + _FLAT) & (points[:, 2] > low) & (points[:, 2] < high + _FLAT)]
+    if not len(meets):
+        return None
     reach = meets @ ahead
     front = float(reach.max())
     return front, float(meets[reach > front - _FLAT, 2].min())

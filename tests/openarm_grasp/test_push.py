@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from openarm_common.errors import Code
+from openarm_grasp.config import GraspConfig
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
+from openarm_grasp.strategies.push import closed_hand, push_ways
 from tests.openarm_grasp.scripted import Follow, Grip
 
 
@@ -102,6 +106,16 @@ def test_what_can_neither_be_grasped_nor_pushed_is_refused_with_both_reasons(rob
     assert "out of reach" in outcome.message
     assert "cannot be pushed into reach either" in outcome.message
     assert not two.done(Follow)
+
+
+@pytest.mark.parametrize("height", [0.001, 0.003, 0.008, 0.05])
+def test_what_is_thinner_than_the_hand_comes_down_to_can_not_be_pushed(robot, height: float) -> None:
+    two = robot(0.46, 0.02)
+    red = two.objects["red"]
+    thin = replace(red, size=np.array([*red.size[:2], height]))
+    hand = closed_hand(two.description, "right")
+    ways = push_ways(thin, np.array([0.40, 0.02]), GraspConfig(), hand, two.session.context.hand)
+    assert bool(ways) == (height > 0.01)
 
 
 @pytest.mark.requirement("N-13")
