@@ -11,10 +11,9 @@ import numpy as np
 
 from openarm_calibration.foreign.image_sets import Names
 from openarm_calibration.handeye.closed_form import REFINED
-from openarm_calibration.handeye.offline import versions
 from openarm_calibration.handeye.pose_pairs import LeftOut, PairSolution, PosePairs, solve_pairs
 from openarm_calibration.handeye.verdict import Grade, Limits
-from openarm_calibration.store.store import StoredCalibration
+from openarm_calibration.store.store import StoredCalibration, versions
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 

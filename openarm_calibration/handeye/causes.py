@@ -20,9 +20,8 @@ from scipy.optimize import minimize_scalar
 
 from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.marks import fit_poses
-from openarm_calibration.handeye.nuisance import fit, with_zeros
 from openarm_calibration.handeye.problem import Extra, Problem, chain
-from openarm_calibration.handeye.refine import mount_error, pixel_noise
+from openarm_calibration.handeye.refine import fit_all, mount_error, pixel_noise, with_zeros
 from openarm_calibration.handeye.unknowns import Estimate, Noise, Priors
 from openarm_calibration.handeye.variants import variants
 from openarm_common.errors import OpenArmError
@@ -119,13 +118,13 @@ def freed(problem: Problem, X: Array, Z: Array, noise: Noise) -> tuple[Estimate,
         Z: (boards, 4, 4) to start from.
         noise: To start from.
     """
-    base = with_zeros(problem, fit(problem, X, Z, noise))
+    base = with_zeros(problem, fit_all(problem, X, Z, noise))
     out: dict[str, Freed] = {}
     for name, extra, priors in _FREED:
         if extra == "delay" and not np.abs(problem.rate).max() > 1e-4:
             continue
         try:
-            found = fit(problem, X, Z, noise, (extra,), priors)
+            found = fit_all(problem, X, Z, noise, (extra,), priors)
         except (OpenArmError, np.linalg.LinAlgError):
             continue
         if "zeros" in base.extras:
@@ -206,7 +205,7 @@ def _other_board(problem: Problem, base: Estimate | None, best_px: float) -> Cau
     if base is None:
         return Cause("wrong board", text, math.inf, math.inf, math.inf)
     try:
-        found = fit(longer, base.X, base.Z, Noise(px, 1e-4, 1e-4))
+        found = fit_all(longer, base.X, base.Z, Noise(px, 1e-4, 1e-4))
     except (OpenArmError, np.linalg.LinAlgError):
         return None
     if "zeros" in base.extras:
@@ -268,7 +267,7 @@ def _mistakes(problem: Problem, base: Estimate | None) -> Iterator[Cause]:
             continue
         done.add(number)
         try:
-            found = fit(part, X, Z, Noise(pixel_noise(part), 1e-3, 1e-3))
+            found = fit_all(part, X, Z, Noise(pixel_noise(part), 1e-3, 1e-3))
         except (OpenArmError, np.linalg.LinAlgError):
             continue
         if found.noise.translation > _HOPELESS[0] or found.noise.rotation > _HOPELESS[1]:

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-import cv2
 import numpy as np
 
 from openarm_calibration.handeye.choice import solve_chosen
@@ -25,7 +23,7 @@ from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.unknowns import Estimate, Outlier, Solution, invert_scaled
 from openarm_calibration.handeye.verdict import Limits, Verdict, assess
 from openarm_calibration.sampling.samples import SampleSet
-from openarm_calibration.store.store import StoredCalibration
+from openarm_calibration.store.store import StoredCalibration, versions
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
 from openarm_common.errors import Code, OpenArmError
@@ -150,16 +148,6 @@ def without_named(samples: SampleSet, names: Sequence[str]) -> None:
         if not name:
             raise OpenArmError(Code.INVALID_ARGUMENT, "an empty name is no sample; give names such as s001")
         samples.remove(name)
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what computed the result."""
-    out = {"opencv": cv2.__version__, "numpy": np.__version__}
-    try:
-        out["openarm-vision"] = version("openarm-vision")
-    except PackageNotFoundError:
-        out["openarm-vision"] = "checkout"
-    return out
 
 
 # --- several cameras

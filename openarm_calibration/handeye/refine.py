@@ -32,6 +32,8 @@ _LOWEST_PX = 1e-3
 _ITERATIONS = 30
 #: Drop of minus twice the log likelihood from which a misfit is accepted: one clean set in two hundred has it.
 _EVIDENT = 6.6
+#: Deviations of the zeros that `with_zeros` tries, rad; each answer starts from the one before.
+_SCALES = tuple(math.radians(degrees) for degrees in (0.03, 0.1, 0.3, 1.0, 3.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,3 +306,55 @@ def mount_error(T_estimated: Array, T_true: Array) -> tuple[float, float]:
     """Return the distance of the origins, m, and angle, rad, between two mounts."""
     offset = float(np.linalg.norm(T_estimated[:3, 3] - T_true[:3, 3]))
     return offset, se3.angle_between(T_true[:3, :3], T_estimated[:3, :3])
+
+
+def fit_all(
+    problem: Problem, X: Array, Z: Array, noise: Noise, extras: tuple[Extra, ...] = (), priors: Priors = FREE
+) -> Estimate:
+    """Return the likeliest answer with the noise as the data have it, and zeros of the joints as the robot has them.
+
+    Args:
+        problem: The views.
+        X: (cameras, 4, 4) to start from.
+        Z: (boards, 4, 4) to start from.
+        noise: To start from.
+        extras: More unknowns.
+        priors: Of these.
+
+    Raises:
+        OpenArmError: As `refine`.
+    """
+    start = replace(noise, translation=max(noise.translation, 1e-4), rotation=max(noise.rotation, 1e-4), misfit=0.0)
+    return refine(problem, X, Z, start, extras=extras, priors=priors, estimate_robot=True, estimate_px=True)
+
+
+def with_zeros(problem: Problem, known: Estimate, priors: Priors = FREE) -> Estimate:
+    """Return the likelier of an answer and the best one in which the zeros of the joints are off too.
+
+    Zeros that are off pass for a board of another size or a longer lens, since a few views of an arm in like postures
+    tell them badly apart. They are a nuisance parameter: a prior of zero mean, whose deviation is the likeliest one
+    (empirical Bayes).
+
+    Args:
+        problem: The views; without joint positions the answer is returned as it is.
+        known: With zeros as the robot reports them.
+        priors: Of its extras.
+    """
+    best = start = known
+    worse = 0
+    for scale in _SCALES if problem.joints else ():
+        wide = replace(priors, zeros=np.full(problem.joints, scale))
+        try:
+            start = refine(
+                problem, start.X, start.Z, replace(start.noise, misfit=0.0), zeros=start.zeros,
+                extras=(*known.extras, "zeros"), priors=wide, estimate_robot=True, estimate_px=True,
+            )  # fmt: skip
+        except (OpenArmError, np.linalg.LinAlgError):
+            break
+        if start.evidence < best.evidence:
+            best, worse = start, 0
+        else:
+            worse += 1
+        if worse == 2:  # the evidence falls and then rises with the scale
+            break
+    return best

@@ -249,6 +249,7 @@ def _two_kinds(problem: Problem, out: Mask, estimate: Estimate) -> float:
     part = at_zeros(problem, estimate).subset(out)
     state, noise = State.start(part, estimate.X, estimate.Z), estimate.noise
     state = replace(state, intrinsics=estimate.intrinsics, scale=estimate.scale, distortion=estimate.distortion)
+    value = math.inf
     for _ in range(5):
         full, KMK, both = linearise(part, state, ()).weighed(noise)
         given = np.ascontiguousarray(full[-1:, -1:]), KMK, np.ascontiguousarray(both[:, :, -1:])

@@ -16,12 +16,11 @@ import numpy as np
 
 from openarm_calibration.handeye.left_out import in_space_squares
 from openarm_calibration.handeye.marks import project
-from openarm_calibration.handeye.offline import versions
 from openarm_calibration.handeye.problem import chain, layout
 from openarm_calibration.handeye.unknowns import Solution
 from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, arm_problem, solve_zeros
 from openarm_calibration.sampling.samples import SampleSet
-from openarm_calibration.store.store import StoredCalibration
+from openarm_calibration.store.store import StoredCalibration, versions
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
 from openarm_common.errors import Code, OpenArmError

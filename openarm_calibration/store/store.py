@@ -7,9 +7,11 @@ A mount is `T_parent_link` of the camera (position in m, quaternion x, y, z, w; 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from pydantic import Field, field_validator
 
@@ -197,3 +199,13 @@ def of_these_mounts(
         else:
             return found, (*faults, *([found.warning] if found.warning else []))
     return None, tuple(faults)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computed the result."""
+    out = {"opencv": cv2.__version__, "numpy": np.__version__}
+    try:
+        out["openarm-vision"] = version("openarm-vision")
+    except PackageNotFoundError:
+        out["openarm-vision"] = "checkout"
+    return out

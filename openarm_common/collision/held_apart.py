@@ -43,7 +43,7 @@ def held_apart(description: RobotDescription, within: float) -> dict[frozenset[s
             continue
         columns = [column[joint.name] for joint in between]
 
-        def distance(q: Sequence[float], columns: list[int] = columns, pairs: Ints = pairs) -> float:
+        def distance(q: Array, columns: list[int] = columns, pairs: Ints = pairs) -> float:
             full = np.zeros(len(movable))
             full[columns] = q
             return float(robot.distances_of(full, pairs).min())
@@ -60,7 +60,7 @@ def _between(description: RobotDescription, first: str, second: str) -> list[Joi
     return [j for j in (*one, *other) if j.type != "fixed" and not (j in one and j in other)]
 
 
-def _least(distance: Callable[[Sequence[float]], float], joints: Sequence[Joint], within: float) -> float | None:
+def _least(distance: Callable[[Array], float], joints: Sequence[Joint], within: float) -> float | None:
     """Return the least distance over the range of the joints, m; None where it is 0 somewhere or not below `within`."""
     low = np.array([max(joint.lower, -math.pi) for joint in joints])
     high = np.array([min(joint.upper, math.pi) for joint in joints])
@@ -81,7 +81,7 @@ def _least(distance: Callable[[Sequence[float]], float], joints: Sequence[Joint]
 
 
 def _descended(
-    distance: Callable[[Sequence[float]], float], q: Array, value: float, low: Array, high: Array, step: Array
+    distance: Callable[[Array], float], q: Array, value: float, low: Array, high: Array, step: Array
 ) -> float:
     """Return the least distance that steps along one joint at a time lead to from a posture, m."""
     while float(step.max()) > _FINEST:

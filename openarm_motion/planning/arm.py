@@ -399,10 +399,13 @@ class Arm(PlanningGroup):
         return time_path(self.names, line.q, line.s, self.limits(scale), speed, self.config.planning.period)
 
 
-@lru_cache(maxsize=4)
 def kept(description: RobotDescription, config: MotionConfig) -> Mapping[frozenset[str], float]:
     """Links that the design of a robot holds nearer to each other than the clearance asks, with their distance, m."""
-    asked = max(config.clearance.own, config.straight.own)
+    return _kept(description, max(config.clearance.own, config.straight.own))
+
+
+@lru_cache(maxsize=4)
+def _kept(description: RobotDescription, asked: float) -> Mapping[frozenset[str], float]:
     found = held_apart(description, asked)
     for links, distance in found.items():
         text = "%s are %.1f mm apart by design: clearance.own, %.1f mm, is not asked of them"
