@@ -50,7 +50,7 @@ def settled(node: Node) -> dict[str, list[str]]:
 def stated_publishers() -> dict[str, list[str]]:
     """Return the nodes that publish each topic."""
     rows = [(name, rest.split("|")[1].strip()) for name, kind, rest in ROW.findall(INTERFACES) if "/msg/" in kind]
-    everyone = sorted([*load_graph("sim").nodes, "move_group"])  # of the process of motion
+    everyone = sorted([*load_graph("sim").nodes, "move_group", "servo_node"])  # these of the process of motion
     return {name: everyone if who == "all" else sorted(w.strip() for w in who.split(",")) for name, who in rows}
 
 

@@ -28,7 +28,7 @@ KNOWN = {
     "nominal": "b20c6508cb10bbeb",
     "clutter": "d174116befcd15a0",
     "endurance": "18c75483273b8d77",
-    "faults": "91be521b681ef941",
+    "faults": "74dd7ff4f91ddee9",
     "handover": "45ff17aef914318b",
     "pairs": "88db651be7bc2133",
     "pairs_in_turn": "b7c091603ddf3f98",

@@ -21,7 +21,7 @@ from openarm_evaluation.campaign.in_process_robot import approach_of
 from openarm_evaluation.campaign.robot import arms_behind
 from openarm_evaluation.campaign.tasks.task import Task, past, within
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.candidates import propose, target_box
+from openarm_grasp.planning.candidates import propose, shorter, target_box
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.interface import PlanGrasp
 from openarm_motion.planning.approach import plan_approach
@@ -107,14 +107,16 @@ def _graspable(scene: Scene, arm: str) -> bool:
     target = Detection(item.label, 1.0, T, np.array(item.size))
     solver = arms_behind((), table)[arm]
     grasps = propose(target, config, RobotDescription.load().hand(arm).parts)
-    request = approach_of(PlanGrasp(arm, grasps, (), (target_box(target, config),)))
-    try:
-        plan_approach(solver, solver.start_state(_home()), request)
-    except OpenArmError as error:
-        if error.code not in NO_WAY:
-            raise
-        return False
-    return True
+    for ways in (grasps, tuple(shorter(one) for one in grasps)):
+        request = approach_of(PlanGrasp(arm, ways, (), (target_box(target, config),)))
+        try:
+            plan_approach(solver, solver.start_state(_home()), request)
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+        else:
+            return True
+    return False
 
 
 def _home() -> Mapping[str, float]:

@@ -136,7 +136,9 @@ def test_out_of_reach_names_the_nearest_arm_distance(bench):
     assert "right arm gets within 250 mm" in answer.message
     assert "too far" in answer.message
     assert "execute" not in bench.world.log
-    assert len(answer.options) == 28
+    ways = [option.id for option in answer.options]
+    assert len(set(ways)) == len(ways) == 56
+    assert {f"{way}/short" for way in ways[:28]} == set(ways[28:])  # near the end of the reach, shorter lines are tried
     assert {(o.arm, o.code, o.message) for o in answer.options} == {("right", "UNREACHABLE", "too far for it")}
 
 
