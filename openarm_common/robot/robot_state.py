@@ -237,6 +237,15 @@ class RobotStateBuffer:
         T_root_source = self._in_root(source, t_ns)
         return se3.inverse(T_root_target) @ T_root_source
 
+    def pose(self, frame: str, q: Mapping[str, float]) -> Array:
+        """Return the pose (4, 4) of a frame in the root for joint positions, rad or m by joint name.
+
+        Raises:
+            OpenArmError: NO_TRANSFORM, as `lookup`.
+        """
+        link, T_link_frame = self._carrier(frame)
+        return self._description.link_pose(link, q) @ T_link_frame
+
     def moves(self, frame: str) -> bool:
         """Whether a moving joint lies between the base and a frame.
 
@@ -247,9 +256,7 @@ class RobotStateBuffer:
         return any(joint.type != "fixed" for joint in self._description.chain(link))
 
     def _in_root(self, frame: str, t_ns: int) -> Array:
-        link, T_link_frame = self._carrier(frame)
-        q = self.joints_at(t_ns, frame) if self.moves(link) else {}
-        return self._description.link_pose(link, q) @ T_link_frame
+        return self.pose(frame, self.joints_at(t_ns, frame) if self.moves(frame) else {})
 
     def _carrier(self, frame: str) -> tuple[str, Array]:
         """Return the link that a frame is fixed to, and T_link_frame."""

@@ -182,14 +182,14 @@ class BaseNode(Node, Generic[ConfigT]):
             try:
                 return callback(*given)
             except OpenArmError as error:
-                self.__refuse(topic, error)
+                self.refuse(topic, error)
 
         @wraps(callback)
         async def take_async(*given: Any) -> Any:
             try:
                 return await callback(*given)
             except OpenArmError as error:
-                self.__refuse(topic, error)
+                self.refuse(topic, error)
 
         guarded: Any = take_async if iscoroutinefunction(callback) else take
         return super().create_subscription(msg_type, topic, guarded, *args, **kwargs)
@@ -200,7 +200,8 @@ class BaseNode(Node, Generic[ConfigT]):
             callback = _refusing_unknown_types(callback)
         return super().create_service(srv_type, srv_name, callback, **kwargs)
 
-    def __refuse(self, topic: str, error: OpenArmError) -> None:
+    def refuse(self, topic: str, error: OpenArmError) -> None:
+        """Count a message that is refused, and report it now and then."""
         self.__refused[topic] += 1
         text = f"message of {topic} refused, {self.__refused[topic]} so far: {error.message}"
         self.get_logger().warning(text, throttle_duration_sec=5.0)
@@ -268,7 +269,7 @@ class BaseNode(Node, Generic[ConfigT]):
 
     def __publish_diagnostics(self) -> None:
         status = self.__status
-        refused = [KeyValue(key=f"refused/{topic}", value=str(count)) for topic, count in self.__refused.items()]
+        refused = [KeyValue(key=f"refused/{topic}", value=str(count)) for topic, count in list(self.__refused.items())]
         status.values = [value for value in status.values if not value.key.startswith("refused/")] + refused
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()

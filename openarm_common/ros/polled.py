@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from typing import Any, NamedTuple
 
+from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -28,8 +29,23 @@ class Source(NamedTuple):
     silence: float = 0.0
 
 
+class Unspun(CallbackGroup):
+    """Keeps its members out of executors."""
+
+    def can_execute(self, entity: object) -> bool:
+        """Never."""
+        return False
+
+    def beginning_execution(self, entity: object) -> bool:
+        """Never."""
+        return False
+
+    def ending_execution(self, entity: object) -> None:
+        """Do nothing: none begins."""
+
+
 class Polled:
-    """A subscription that is polled; its node is not spun.
+    """A subscription that is polled; whoever spins its node does not see it.
 
     Args:
         node: Owns it.
@@ -39,19 +55,27 @@ class Polled:
     def __init__(self, node: Node, source: Source) -> None:
         self._node, self._source = node, source
         # The callback is never called.
-        self._subscription: Any = node.create_subscription(source.kind, source.topic, lambda _: None, source.qos)
+        self._subscription: Any = node.create_subscription(
+            source.kind, source.topic, lambda _: None, source.qos, callback_group=Unspun()
+        )
         self._received_at = time.monotonic()
 
     def take(self) -> list[Any]:
         """All messages that wait."""
-        taken: list[Any] = []
+        return [message for message, _ in self.take_timed()]
+
+    def take_timed(self) -> list[tuple[Any, float]]:
+        """All messages that wait, and when each arrived, s of the monotonic clock."""
+        taken: list[tuple[Any, float]] = []
         handle, kind = self._subscription.handle, self._subscription.msg_type
         with handle:
             while (one := handle.take_message(kind, False)) is not None:
-                taken.append(one[0])
+                taken.append((one[0], one[1]["received_timestamp"] * 1e-9))
         if taken:
-            self._received_at = time.monotonic()
-        return taken
+            self._received_at = now = time.monotonic()
+            wall = time.time()
+            return [(message, now - max(0.0, wall - at)) for message, at in taken]
+        return []
 
     def newest(self) -> Any | None:
         """The newest message that waits, or None when nothing has come."""

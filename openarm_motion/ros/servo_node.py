@@ -7,6 +7,7 @@ switch_command_type, below /servo_node for all arms, and with two arms below /AR
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 import traceback
@@ -18,14 +19,16 @@ from control_msgs.msg import JointJog
 from geometry_msgs.msg import TwistStamped
 from moveit_msgs.msg import ServoStatus
 from moveit_msgs.srv import ServoCommandType
+from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.pacing import Pacer, PeriodMeter
-from openarm_common.ros.convert import ns_to_stamp, trajectory_to_msg
+from openarm_common.ros.convert import joints_from_msg, ns_to_stamp, stamp_to_ns, trajectory_to_msg
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
+from openarm_common.ros.polled import Polled, Source
 from openarm_motion.config import ServoConfig
 from openarm_motion.servo.arm_servo import Report, Status
 from openarm_motion.servo.servo import Servo
@@ -36,6 +39,10 @@ if TYPE_CHECKING:
 
 #: How often is looked whether the surroundings have changed, s; and one of so many set points comes with a status.
 _REFRESH, _TELL = 0.1, 5
+#: From one look for commands to the next while none is taken, s: they are refused.
+_IDLE = 0.05
+#: Other threads of the process give way after this, s; by default they do after 5 ms.
+_SWITCH = 0.0005
 
 _TYPES = {ServoCommandType.Request.JOINT_JOG: "joint jog", ServoCommandType.Request.TWIST: "twist"}
 
@@ -73,7 +80,8 @@ class ServoNode(BaseNode[NoParameters]):
         self._ends = [_End(self, "", names)]
         if len(names) > 1:
             self._ends += [_End(self, f"/{arm}", (arm,)) for arm in names]
-        self._periods, self._refreshing, self._closing = PeriodMeter(), False, False
+        self._states = Polled(self, Source(JointState, "/joint_states", QOS_COMMAND))
+        self._periods, self._refreshing, self._closing = PeriodMeter(), False, threading.Event()
         self._said: dict[str, Report] = {}
         self.create_timer(_REFRESH, self._refresh, clock=self.steady_clock)  # pyright: ignore[reportArgumentType]
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
@@ -82,8 +90,7 @@ class ServoNode(BaseNode[NoParameters]):
 
     def close(self) -> None:
         """Stop, then as every node."""
-        self._closing = True
-        self.servo.active.set()
+        self._closing.set()
         self._thread.join(timeout=1.0)
         super().close()
 
@@ -95,30 +102,42 @@ class ServoNode(BaseNode[NoParameters]):
                 end.status.publish(message)
 
     def _run(self) -> None:
-        """Give set points at their pace while an arm is commanded."""
+        """Take commands and give set points at their pace.
+
+        Topics are polled here: the executor, which serves all nodes of the process, is late when there is much to do.
+        """
+        sys.setswitchinterval(_SWITCH)
         pacer, count = Pacer(self._period_ns, max_debt_ns=self._period_ns), 0
-        while True:
-            if not self.servo.active.is_set():
-                pacer.restart()
-                self._periods.restart()
-                self._tell_all()
-                self.servo.active.wait()
-            if self._closing:
-                return
+        while not self._closing.wait(0.0 if self.servo.started or self.servo.active else _IDLE):
             now_ns = time.monotonic_ns()
             wait_ns = pacer.wait_ns(now_ns)
             if wait_ns > 0:
                 time.sleep(wait_ns * 1e-9)
-                continue
+                now_ns += wait_ns
             pacer.ticked(now_ns)
-            self._periods.add(now_ns)
             try:
-                self.servo.tick(time.monotonic())
+                self._listen()
+                if self.servo.active:
+                    self._periods.add(time.monotonic_ns())
+                    self.servo.tick(time.monotonic())
+                else:
+                    self._periods.restart()
             except Exception as error:  # an arm must not go on, and the node has more to do than this
                 self.get_logger().error(f"servoing ends: {error!r}\n{traceback.format_exc()}")
                 self.servo.fail(f"{error!r}; call start_servo to go on")
             count += 1
             self._tell_all(every=count % _TELL == 0)
+
+    def _listen(self) -> None:
+        for message, at in self._states.take_timed():
+            try:
+                joints_from_msg(message)
+            except OpenArmError:  # the motion node says so
+                continue
+            stamp_ns = stamp_to_ns(message.header.stamp)
+            self.servo.hear(stamp_ns, dict(zip(message.name, message.position, strict=True)), at)
+        for end in self._ends:
+            end.listen()
 
     def _tell_all(self, *, every: bool = False) -> None:
         for arm, report in self.servo.reports().items():
@@ -174,12 +193,19 @@ class _End:
         name = f"{prefix}/servo_node"
         self._name = name
         self.status = node.create_publisher(ServoStatus, f"{name}/status", QOS_COMMAND)
-        node.create_subscription(TwistStamped, f"{name}/delta_twist_cmds", self._on_twist, QOS_COMMAND)
-        node.create_subscription(JointJog, f"{name}/delta_joint_cmds", self._on_jog, QOS_COMMAND)
+        self._twists = Polled(node, Source(TwistStamped, f"{name}/delta_twist_cmds", QOS_COMMAND))
+        self._jogs = Polled(node, Source(JointJog, f"{name}/delta_joint_cmds", QOS_COMMAND))
         node.create_service(Trigger, f"{name}/start_servo", self._on_start)
         node.create_service(Trigger, f"{name}/stop_servo", self._on_stop)
         node.create_service(SetBool, f"{name}/pause_servo", self._on_pause)
         node.create_service(ServoCommandType, f"{name}/switch_command_type", self._on_switch)
+
+    def listen(self) -> None:
+        """Take the commands that have come."""
+        for message, at in self._twists.take_timed():
+            self._answer("delta_twist_cmds", lambda m=message, at=at: self._take_twist(m, at))
+        for message, at in self._jogs.take_timed():
+            self._answer("delta_joint_cmds", lambda m=message, at=at: self._take_jog(m, at))
 
     async def _on_start(self, _: Any, response: Any) -> Any:
         try:
@@ -212,40 +238,33 @@ class _End:
             self._node.get_logger().warning(text)
         return response
 
-    def _on_twist(self, message: TwistStamped) -> None:
+    def _take_twist(self, message: TwistStamped, at: float) -> None:
         linear, angular, frame = message.twist.linear, message.twist.angular, message.header.frame_id
+        self._check_type(ServoCommandType.Request.TWIST)
+        arm = self._arm_of(frame)
+        self._node.check_hold(arm, b"")
         twist = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
+        self._node.servo.twist(arm, twist, frame, at)
 
-        def take() -> None:
-            self._check_type(ServoCommandType.Request.TWIST)
-            arm = self._arm_of(frame)
-            self._node.check_hold(arm, b"")
-            self._node.servo.twist(arm, twist, frame, time.monotonic())
+    def _take_jog(self, message: JointJog, at: float) -> None:
+        self._check_type(ServoCommandType.Request.JOINT_JOG)
+        if message.displacements or message.duration:
+            text = "displacements and duration are not supported, expected none; give velocities"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
+        arm = self._node.servo.arm_of(list(message.joint_names))
+        if arm not in self.arms:
+            text = f"joint_names are of the {arm} arm, expected joints of {', '.join(self.arms)}"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
+        self._node.check_hold(arm, b"")
+        self._node.servo.jog(list(message.joint_names), list(message.velocities), at)
 
-        self._answer(take)
-
-    def _on_jog(self, message: JointJog) -> None:
-        def take() -> None:
-            self._check_type(ServoCommandType.Request.JOINT_JOG)
-            if message.displacements or message.duration:
-                text = "displacements and duration are not supported, expected none; give velocities"
-                raise OpenArmError(Code.INVALID_ARGUMENT, text)
-            arm = self._node.servo.arm_of(list(message.joint_names))
-            if arm not in self.arms:
-                text = f"joint_names are of the {arm} arm, expected joints of {', '.join(self.arms)}"
-                raise OpenArmError(Code.INVALID_ARGUMENT, text)
-            self._node.check_hold(arm, b"")
-            self._node.servo.jog(list(message.joint_names), list(message.velocities), time.monotonic())
-
-        self._answer(take)
-
-    def _answer(self, take: Callable[[], None]) -> None:
+    def _answer(self, topic: str, take: Callable[[], None]) -> None:
         """Take a command; a refusal is a status, too."""
         try:
             take()
         except OpenArmError as error:
             self.status.publish(ServoStatus(code=int(Status.INVALID), message=f"{error.code}: {error.message}"))
-            raise
+            self._node.refuse(f"{self._name}/{topic}", error)
 
     def _check_type(self, given: int) -> None:
         if self._type not in (None, given):

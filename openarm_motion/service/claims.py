@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Generator
 from contextlib import contextmanager
 
@@ -12,10 +13,11 @@ _GOAL = "is moving already; wait for the end, or cancel it first"
 
 
 class ArmClaims:
-    """Arms that are taken."""
+    """Arms that are taken; from any thread."""
 
     def __init__(self) -> None:
         self._taken: dict[str, str] = {}
+        self._lock = threading.Lock()
 
     def take(self, *names: str, why: str = _GOAL) -> None:
         """Take arms.
@@ -27,10 +29,11 @@ class ArmClaims:
         Raises:
             OpenArmError: BUSY, when one of them is taken.
         """
-        for name in names:
-            if name in self._taken:
-                raise OpenArmError(Code.BUSY, f"the {name} arm {self._taken[name]}")
-        self._taken.update(dict.fromkeys(names, why))
+        with self._lock:
+            for name in names:
+                if name in self._taken:
+                    raise OpenArmError(Code.BUSY, f"the {name} arm {self._taken[name]}")
+            self._taken.update(dict.fromkeys(names, why))
 
     def give(self, *names: str) -> None:
         """Give arms back."""

@@ -348,8 +348,8 @@ class MotionService:
             error = moves.unreachable(arm, pose, position_only=position_only, margin=0.0, near=start)
         return IkAnswer(best, arm.kinematics.fk(best.q), error)
 
-    def in_base(self, pose: Array, frame: str = "") -> Array:
-        """Bring a pose (4, 4) in any known frame to the base frame.
+    def in_base(self, pose: Array, frame: str = "", state: Mapping[str, float] = EMPTY) -> Array:
+        """Bring a pose (4, 4) in any known frame to the base frame; with joints in a state, or where they are.
 
         Raises:
             OpenArmError: NO_TRANSFORM, listing the frames there are.
@@ -357,6 +357,8 @@ class MotionService:
         if frame in ("", *self._frames):
             return pose
         states = self.robot.states
+        if state:
+            return states.pose(frame, state) @ pose
         stamp_ns = states.latest()[0] if self.robot.state_age() < float("inf") else 0
         return states.lookup(self._frames[-1], frame, stamp_ns) @ pose
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 #: A set point is this far ahead of robot time, s: what it takes to arrive; the first one, which meets the arm's sag.
 _LEAD, _FIRST_LEAD = 0.012, 0.1
-#: A set point is followed for so long where no other comes, s; then the arm stops.
+#: A set point is followed for so long, s, where no other comes, and no longer than its command counts; then comes the stop.
 _HOLD = 0.025
 #: Set points that are nearer in time are one, s.
 _LEAST = 0.002
@@ -92,6 +92,7 @@ class ArmServo:
         self._since_ns = 0
         self._told: deque[tuple[int, Array]] = deque(maxlen=64)
         self._share = 1.0  # of the speed wanted, that was kept last
+        self._hold = _HOLD
         self._fault, self._heard = "", -np.inf
         self.report = Report()
 
@@ -166,6 +167,8 @@ class ArmServo:
         if self._command is not None and wall - self._command.at > self._config.incoming_command_timeout:
             self._command = None
         command = self._command
+        if command is not None:
+            self._hold = min(_HOLD, command.at + self._config.incoming_command_timeout - wall)
         return (None, False) if command is None else (command.velocity, command.is_twist)
 
     def _resting_place(self, measured: Array) -> Array:
@@ -246,7 +249,7 @@ class ArmServo:
     def _course_of(self, start: JointState, velocity: Array, share: float) -> tuple[Course, Course]:
         """A course, and the same that goes on for longer."""
         longer = _HOLD + self._config.lookahead
-        first = Course.of(start, share * velocity, _HOLD if share > 0.0 else 0.0, self._limits)
+        first = Course.of(start, share * velocity, self._hold if share > 0.0 else 0.0, self._limits)
         return first, first if share <= 0.0 else Course.of(start, share * velocity, longer, self._limits)
 
     def _refusal(

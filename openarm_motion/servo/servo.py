@@ -30,7 +30,7 @@ _SAMPLES, _AHEAD = 8, 1.0
 
 
 class Servo:
-    """Servoing. Commands and `refresh` come from the event loop, `tick` from a thread of its own.
+    """Servoing. `start`, `stop` and `refresh` come from the event loop, all else from one thread that keeps the pace.
 
     Args:
         service: Whose arms, planning scene and map these are.
@@ -43,11 +43,13 @@ class Servo:
         self._lock = threading.Lock()
         self._around: Surroundings | None = None
         self._seen: object = None
+        #: Positions of the joints; stamp and time of arrival, s, of the newest that are of an arm.
+        self._state: dict[str, float] = {}
+        self._heard: dict[str, tuple[int, float]] = {}
         self._missing = "the surroundings were not looked at yet"
         self._started: set[str] = set()
         #: Arms that are claimed, and whether there is one.
         self._claimed: set[str] = set()
-        self.active = threading.Event()
         tolerance = service.config.execution.start_tolerance
         self._make: Callable[[str], ArmServo] = lambda name: ArmServo(service.arms[name], config, tolerance)
         self._arms = {name: self._make(name) for name in service.arms}
@@ -70,6 +72,24 @@ class Servo:
         """Whether an arm is commanded or under way."""
         return self._arms[name].busy
 
+    @property
+    def active(self) -> bool:
+        """Whether any arm is."""
+        return bool(self._claimed)
+
+    def hear(self, stamp_ns: int, state: Mapping[str, float], at: float) -> None:
+        """Take a joint state.
+
+        Args:
+            stamp_ns: Robot time.
+            state: Positions by joint, rad or m; of all joints of an arm, or of none.
+            at: When it arrived, s.
+        """
+        self._state.update(state)
+        for name, servo in self._arms.items():
+            if state.keys() >= set(servo.arm.names):
+                self._heard[name] = stamp_ns, at
+
     # --- who may command
     async def start(self, names: Sequence[str]) -> None:
         """Take commands of arms from now on.
@@ -87,14 +107,14 @@ class Servo:
             for name in names:
                 self._arms[name].halt()
 
-    def twist(self, name: str, twist: Array, frame: str, wall: float) -> None:
+    def twist(self, name: str, twist: Array, frame: str, at: float) -> None:
         """Move a tool by a twist.
 
         Args:
             name: Arm.
             twist: (6,) linear and angular velocity of the tool's origin, in axes of the frame.
             frame: Any frame of the robot; "": the base frame.
-            wall: Present time, s.
+            at: When the command came, s.
 
         Raises:
             OpenArmError: NOT_READY, when servoing is not started; INVALID_ARGUMENT, for numbers that are none or too
@@ -102,17 +122,19 @@ class Servo:
         """
         scale = self._config.scale
         velocity = self._checked(twist, "xyz", "twist") * np.repeat(self._units(scale.linear, scale.rotational), 3)
-        turn = self._service.in_base(np.eye(4), frame)[:3, :3]
+        if name not in self._heard:
+            raise OpenArmError(Code.NOT_READY, f"no /joint_states of the {name} arm yet; is its driver running?")
+        turn = self._service.in_base(np.eye(4), frame, self._state)[:3, :3]
         base = np.concatenate([turn @ velocity[:3], turn @ velocity[3:]])
-        self._take(name, Command(base, wall, is_twist=True))
+        self._take(name, Command(base, at, is_twist=True))
 
-    def jog(self, names: Sequence[str], velocities: Sequence[float], wall: float) -> None:
+    def jog(self, names: Sequence[str], velocities: Sequence[float], at: float) -> None:
         """Move joints of one arm with velocities.
 
         Args:
             names: Joints; the others of the arm rest.
             velocities: One for each.
-            wall: Present time, s.
+            at: When the command came, s.
 
         Raises:
             OpenArmError: as `twist`.
@@ -125,7 +147,7 @@ class Servo:
         given = self._checked(np.array(velocities, dtype=np.float64), names, "velocity of")
         velocity = np.zeros(len(joints))
         velocity[[joints.index(joint) for joint in names]] = given * self._units(self._config.scale.joint)
-        self._take(name, Command(velocity, wall, is_twist=False))
+        self._take(name, Command(velocity, at, is_twist=False))
 
     def arm_of(self, joints: Sequence[str]) -> str:
         """The arm that joints belong to.
@@ -175,7 +197,6 @@ class Servo:
                     arm = self._arms[name] = self._make(name)
                 self._service.claims.take(name, why=_OWNED)
                 self._claimed.add(name)
-                self.active.set()
             arm.take(command)
 
     # --- what is around
@@ -210,7 +231,6 @@ class Servo:
                 self._arms[name].report = Report(Status.INVALID, f"the {name} arm stops: {why}")
                 self._service.claims.give(name)
             self._claimed.clear()
-            self.active.clear()
 
     def tick(self, wall: float) -> None:
         """Tell every arm that is commanded its next set point; at the pace of `publish_period`.
@@ -219,13 +239,13 @@ class Servo:
             wall: Present time, s.
         """
         with self._lock:
-            age = self._service.robot.state_age()
-            stamp_ns, state = self._service.robot.states.latest()
-            now_ns = stamp_ns + round(min(age, _FORESEEN) * 1e9)
             for name in sorted(self._claimed):
-                self._tick(name, now_ns, wall, stamp_ns, state, age)
+                self._tick(name, wall)
 
-    def _tick(self, name: str, now_ns: int, wall: float, stamp_ns: int, state: Mapping[str, float], age: float) -> None:
+    def _tick(self, name: str, wall: float) -> None:
+        stamp_ns, at = self._heard.get(name, (0, -np.inf))
+        age = wall - at
+        now_ns = stamp_ns + round(min(max(age, 0.0), _FORESEEN) * 1e9)
         arm = self._arms[name]
         why = ""
         if age > _STALE:
@@ -238,8 +258,8 @@ class Servo:
             arm.halt()
         around = self._around
         if around is not None and age <= _STALE:
-            others = {other: self._others(other, now_ns, state) for other in around.names if other != name}
-            measured = np.array([state[joint] for joint in arm.arm.names])
+            others = {other: self._others(other, now_ns) for other in around.names if other != name}
+            measured = self._positions(name)
             told = arm.tick(now_ns, wall, (stamp_ns, measured), around, others)
             if told is not None:
                 self._send(name, *told)
@@ -250,13 +270,14 @@ class Servo:
         if not arm.busy:
             self._service.claims.give(name)
             self._claimed.discard(name)
-            if not self._claimed:
-                self.active.clear()
 
-    def _others(self, name: str, now_ns: int, state: Mapping[str, float]) -> Array:
+    def _positions(self, name: str) -> Array:
+        return np.array([self._state[joint] for joint in self._arms[name].arm.names])
+
+    def _others(self, name: str, now_ns: int) -> Array:
         """Positions (m, n) of another arm from now on."""
         arm = self._arms[name]
-        here = np.array([[state[joint] for joint in arm.arm.names]])
+        here = self._positions(name)[None]
         if arm.busy:
             return np.concatenate([here, arm.ahead(now_ns)])
         motion = self._service.coordination.followers[name].active

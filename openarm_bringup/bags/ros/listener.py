@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.subscription import Subscription
@@ -23,6 +22,7 @@ from openarm_bringup.messages import interface
 from openarm_common.camera.cameras import depth_cameras, hand_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import offered_qos
+from openarm_common.ros.polled import Unspun
 
 _ROBOT = "/joint_states|/tf|/tf_static|/clock|/robot_description"
 _REQUESTS = r"/detections_2d|/detections_3d|/grasp/.*|/motion/.*|/.*/controller_state|/diagnostics|/sim/ground_truth/.*"
@@ -93,7 +93,7 @@ class Listener:
         self._put = put
         self._depth = depth
         self._thinner = Thinner(image_rate)
-        self._group = _Polled()
+        self._group = Unspun()
         self._refused: set[str] = set()
         #: Types of the topics that are taken while another node does.
         self._followed: dict[str, str] = {}
@@ -172,19 +172,6 @@ class Listener:
 
 def _unused(_: bytes) -> None:
     """The callback of a reader that is polled, not spun."""
-
-
-class _Polled(CallbackGroup):
-    """Keeps its members out of executors."""
-
-    def can_execute(self, entity: object) -> bool:
-        return False
-
-    def beginning_execution(self, entity: object) -> bool:
-        return False
-
-    def ending_execution(self, entity: object) -> None:
-        pass
 
 
 class Thinner:
