@@ -195,6 +195,9 @@ class ServoConfig(Config):
     incoming_command_timeout: float = Field(
         default=0.025, ge=0.01, le=1.0, description="the arm stops when no command came for so long, s"
     )
+    thread_priority: int = Field(
+        default=40, ge=0, le=99, description="of the process under SCHED_FIFO, where the system allows it; 0: ordinary"
+    )
     lower_singularity_threshold: float = Field(
         default=17.0, gt=1.0, description="condition number of the Jacobian from which on twists are slowed"
     )

@@ -9,8 +9,8 @@ import traceback
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from openarm_common.priority import use_fifo
 from openarm_common.ros.node import BaseNode, ConfigT
-from openarm_control.priority import use_fifo
 
 
 class ControlNode(BaseNode[ConfigT]):

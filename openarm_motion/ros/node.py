@@ -23,6 +23,7 @@ from visualization_msgs.msg import MarkerArray
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.distance_field import DistanceFieldReader, field_path
+from openarm_common.priority import use_fifo
 from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix
 from openarm_common.ros.holds import HoldListener
@@ -289,9 +290,17 @@ def _end(handle: ServerGoalHandle, result: Any, answer: MotionAnswer) -> Any:
     return result
 
 
+def _timely() -> MotionNode:
+    """Make the node; what keeps the pace of servoing is scheduled before what plans, whose threads come later."""
+    node = MotionNode()
+    if node.config.servo.enabled and (priority := node.config.servo.thread_priority):
+        node.get_logger().info(f"scheduled as {use_fifo(priority)}")
+    return node
+
+
 def main() -> None:
     """Run the node."""
-    run(MotionNode)
+    run(_timely)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 #: A set point is this far ahead of robot time, s: what it takes to arrive; the first one, which meets the arm's sag.
 _LEAD, _FIRST_LEAD = 0.012, 0.1
-#: A set point is followed for so long, s, where no other comes, and no longer than its command counts; then comes the stop.
+#: A set point is followed for so long, s, where no other comes, and no longer than its command counts; then it stops.
 _HOLD = 0.025
 #: Set points that are nearer in time are one, s.
 _LEAST = 0.002
@@ -259,17 +259,14 @@ class ArmServo:
         name = self.arm.name
         if bound := self._bound(course.start.q, further.end):
             return Report(Status.JOINT_BOUND, f"the {name} arm slows: {bound}")
-        count = max((len(rows) for rows in others.values()), default=1)
         for one in (further, course):
-            path = one.positions()
-            still = [{other: rows[min(k, len(rows) - 1)] for other, rows in others.items()} for k in range(count)]
-            ways = [around.joined({name: path, **at}) for at in still]
+            ways = around.beside(name, one.positions(), others)
             if clear:
-                hit = None if around.free(np.concatenate(ways)) else ways
+                hit = None if around.free(np.concatenate(ways)) else ways[0]
             else:
-                hit = next(([way] for way in ways if not around.no_nearer(way[[0, len(way) // 2, -1]])), None)
+                hit = next((way for way in ways if not around.no_nearer(way[[0, len(way) // 2, -1]])), None)
             if hit is not None:
-                return Report(Status.DECELERATE_FOR_COLLISION, f"the {name} arm slows: {self._what(hit[0], around)}")
+                return Report(Status.DECELERATE_FOR_COLLISION, f"the {name} arm slows: {self._what(hit, around)}")
         return None
 
     def _what(self, way: Array, around: Surroundings) -> str:

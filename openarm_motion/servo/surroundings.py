@@ -74,6 +74,23 @@ class Surroundings:
         each = [np.broadcast_to(np.atleast_2d(parts[name]), (rows, parts[name].shape[-1])) for name in self.names]
         return np.hstack(each)
 
+    def beside(self, name: str, path: Array, others: Mapping[str, Array]) -> Array:
+        """Configurations (k, m, n) of all arms: one on its path (m, i) beside each of up to k positions of the others.
+
+        Args:
+            name: The arm.
+            path: Its positions.
+            others: Positions (up to k, j) of each other arm; the last one stands for those that lack.
+        """
+        count, steps = max((len(rows) for rows in others.values()), default=1), len(path)
+        parts = [
+            np.tile(path, (count, 1))
+            if one == name
+            else np.repeat(others[one][np.minimum(np.arange(count), len(others[one]) - 1)], steps, axis=0)
+            for one in self.names
+        ]
+        return np.hstack(parts).reshape(count, steps, -1)
+
     def free(self, states: Array) -> bool:
         """Whether configurations (m, n) are proven free; between two of a course lies less than the clearance."""
         return bool(self.fast.free_many(states).all())

@@ -9,11 +9,11 @@ import sys
 
 import pytest
 
-from openarm_control.priority import use_fifo
+from openarm_common.priority import use_fifo
 
 PROBE = """
 import os, subprocess, sys, threading
-from openarm_control.priority import use_fifo
+from openarm_common.priority import use_fifo
 stop = threading.Event()
 thread = threading.Thread(target=stop.wait); thread.start()
 said = use_fifo(7)
