@@ -22,7 +22,7 @@ from openarm_motion.timing.trajectory import Motion
 
 if TYPE_CHECKING:
     from openarm_motion.planning.arm import Arm
-    from openarm_motion.servo.surroundings import Surroundings
+    from openarm_motion.servo.surroundings import Near, Surroundings
 
 #: A set point is this far ahead of robot time, s: what it takes to arrive; the first one, which meets the arm's sag.
 _LEAD, _FIRST_LEAD = 0.012, 0.1
@@ -35,6 +35,8 @@ _BEFORE = 0.03
 #: A share of the speed that keeps clear is searched for so often, from a little more than the last one downwards; less
 #: than the least share is none.
 _TRIES, _FASTER, _SLOWER, _LEAST_SHARE = 5, 1.25, 0.6, 0.02
+#: The same while something is too near already.
+_ESCAPES = 3
 #: Share of the speed while something is too near already, and least one on the way out of a singular posture.
 _ESCAPE, _LEAVING = 0.3, 0.3
 #: What the condition number is compared over, s.
@@ -226,11 +228,13 @@ class ArmServo:
             return self._course_of(start, velocity, 0.0)[0]
         here = around.joined({self.arm.name: start.q, **{name: rows[0] for name, rows in others.items()}})
         clear = around.free(here)
+        ends = {name: rows[[0, -1]] for name, rows in others.items()}
+        near = None if clear else around.near(around.beside(self.arm.name, start.q[None], ends)[:, 0])
         kept, hit, course = 0.0, Report(), self._course_of(start, velocity, 0.0)[0]
         tried = min(self._share * _FASTER + _LEAST_SHARE, 1.0 if clear else _ESCAPE)
-        for _ in range(_TRIES):
+        for _ in range(_TRIES if clear else _ESCAPES):
             candidate, further = self._course_of(start, velocity, tried)
-            refusal = self._refusal(candidate, further, around, others, clear=clear)
+            refusal = self._refusal(candidate, further, around, others if near is None else ends, near)
             if refusal is None:
                 course, kept = candidate, tried
                 break
@@ -253,20 +257,23 @@ class ArmServo:
         return first, first if share <= 0.0 else Course.of(start, share * velocity, longer, self._limits)
 
     def _refusal(
-        self, course: Course, further: Course, around: Surroundings, others: Mapping[str, Array], *, clear: bool
+        self,
+        course: Course,
+        further: Course,
+        around: Surroundings,
+        others: Mapping[str, Array],
+        near: list[Near] | None,
     ) -> Report | None:
-        """Why a course may not be followed; None: it may."""
+        """Why a course may not be followed; None: it may. One that begins too `near` may not end nearer."""
         name = self.arm.name
         if bound := self._bound(course.start.q, further.end):
             return Report(Status.JOINT_BOUND, f"the {name} arm slows: {bound}")
-        for one in (further, course):
-            ways = around.beside(name, one.positions(), others)
-            if clear:
-                hit = None if around.free(np.concatenate(ways)) else ways[0]
-            else:
-                hit = next((way for way in ways if not around.no_nearer(way[[0, len(way) // 2, -1]])), None)
-            if hit is not None:
-                return Report(Status.DECELERATE_FOR_COLLISION, f"the {name} arm slows: {self._what(hit, around)}")
+        for one in (further, course) if near is None else (course,):
+            path = one.positions() if near is None else one.end[None]
+            ways = around.beside(name, path, others)
+            free = around.free(np.concatenate(ways)) if near is None else around.no_nearer(ways[:, 0], near)
+            if not free:
+                return Report(Status.DECELERATE_FOR_COLLISION, f"the {name} arm slows: {self._what(ways[0], around)}")
         return None
 
     def _what(self, way: Array, around: Surroundings) -> str:

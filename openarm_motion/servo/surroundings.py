@@ -24,6 +24,10 @@ from openarm_motion.planning.dual_arm import DualArm
 _SLACK = 1e-4
 
 
+#: Pairs that are too near, and their distances, m.
+Near = dict[tuple[str, str], float]
+
+
 def _pair(contact: Contact) -> tuple[str, str]:
     return contact.first, contact.second
 
@@ -66,7 +70,10 @@ class Surroundings:
             scene = arms[0].scene(now.state, (), held[0], environment=environment, clearance=clearance)
         asked = ExitStack()
         asked.enter_context(scene.further(lag * scene.swings().sum(axis=1)))
-        return cls(tuple(arm.name for arm in arms), scene, FastScene(scene.arms, scene.arms[0].distances), asked)
+        found = cls(tuple(arm.name for arm in arms), scene, FastScene(scene.arms, scene.arms[0].distances), asked)
+        here = np.array([[now.state[joint] for arm in arms for joint in arm.names]])
+        found.free(here), found.near(here)  # the first checks take longer, and while servoing nothing may
+        return found
 
     def joined(self, parts: Mapping[str, Array]) -> Array:
         """Configurations (m, n) of all arms, of those (m, k) or (k,) of each."""
@@ -95,13 +102,15 @@ class Surroundings:
         """Whether configurations (m, n) are proven free; between two of a course lies less than the clearance."""
         return bool(self.fast.free_many(states).all())
 
-    def no_nearer(self, path: Array) -> bool:
-        """Whether on configurations (m, n) nothing comes nearer than it may, or than it is at the first of them."""
-        before = {_pair(contact): contact.distance for contact in self.exact.contacts(path[0])}
-        for q in path[1:]:
+    def near(self, states: Array) -> list[Near]:
+        """What is too near at configurations (m, n): by pair, its distance, m. An exact check takes 0.8 ms."""
+        return [{_pair(contact): contact.distance for contact in self.exact.contacts(q)} for q in states]
+
+    def no_nearer(self, states: Array, before: Sequence[Near]) -> bool:
+        """Whether at configurations (m, n) nothing is nearer than it may, or than it was before, from `near`."""
+        for q, allowed in zip(states, before, strict=True):
             for contact in self.exact.contacts(q):
-                allowed = before.get(_pair(contact))
-                if allowed is None or contact.distance < allowed - _SLACK:
+                if contact.distance < allowed.get(_pair(contact), np.inf) - _SLACK:
                     return False
         return True
 
