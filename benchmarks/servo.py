@@ -11,8 +11,8 @@ commands cease, after half a second of a steady joint velocity. Printed are:
     contacts    joint states in which the arms overlap the table, a body, the other arm or themselves, by exact
                 geometry of the collision shapes (states 10 ms apart)
     period      of set points while an arm is commanded, 99 % of the last 10 s at the end, as /diagnostics says, ms
-    halts       from the last command to where the set point slows by a tenth, ms
-    rests       from the last command to where the set point rests, ms
+    begins      from the last command to where the speed of the set point begins to fall (by 1 %), ms
+    rests       from the last command to where the set point rests, within the limits of acceleration and jerk, ms
 
 The peer is a plain resolved-rate jog: the same commands, a damped pseudo-inverse, joint limits, no look-ahead.
 """
@@ -302,7 +302,7 @@ def _plain_step(arm: Arm, q: Array, command: Jog) -> Array:
 
 
 def stops(seen: Seen) -> tuple[list[float], list[float]]:
-    """From each last command to where a set point that moved slows, and to where it rests, ms."""
+    """From each last command to where the speed of a steady set point begins to fall, and to where it rests, ms."""
     slows: list[float] = []
     rests: list[float] = []
     for speeds in seen.speeds.values():
@@ -311,7 +311,7 @@ def stops(seen: Seen) -> tuple[list[float], list[float]]:
             before, after = (t > pause - 0.05) & (t <= pause), (t > pause) & (t < pause + _PAUSE)
             if not before.any() or v[before].min() < 0.1 or np.ptp(v[before]) > 0.1 * v[before].max():
                 continue  # it rests already, or speeds up or slows for another reason
-            slower, still = after & (v < 0.9 * v[before].min()), after & (v < 1e-3)
+            slower, still = after & (v < 0.99 * v[before].min()), after & (v < 1e-3)
             slows.append(1e3 * (t[slower][0] - pause) if slower.any() else np.inf)
             rests.append(1e3 * (t[still][0] - pause) if still.any() else np.inf)
     return slows, rests
@@ -370,7 +370,7 @@ def _row(seed: int, seen: Seen, arms: Mapping[str, Arm], bodies: Sequence[Box]) 
         "moved_rad": round(moved, 1),
         "trajectories": seen.trajectories,
         "period_p99_ms": seen.periods[-1] if seen.periods else np.inf,
-        "halts_ms": [round(x) for x in slows],
+        "begins_ms": [round(x) for x in slows],
         "rests_ms": [round(x) for x in rests],
         "status": seen.status,
     }
@@ -378,7 +378,7 @@ def _row(seed: int, seen: Seen, arms: Mapping[str, Arm], bodies: Sequence[Box]) 
 
 def _rows(robot: str, found: Sequence[Mapping[str, Any]], *, peer: bool) -> list[Row]:
     states = sum(row["states"] for row in found)
-    slows, rests = ([x for row in found for x in row[key]] for key in ("halts_ms", "rests_ms"))
+    slows, rests = ([x for row in found for x in row[key]] for key in ("begins_ms", "rests_ms"))
     theirs = float(sum(row["peer"] for row in found)) if peer else None
     plain = "resolved rate without look-ahead" if peer else ""
     out = [
@@ -387,7 +387,7 @@ def _rows(robot: str, found: Sequence[Mapping[str, Any]], *, peer: bool) -> list
         ),
         Row(f"servo period p99, {robot}", max(r["period_p99_ms"] for r in found), "ms", "lower", 15.0, n=states),
     ]
-    for name, values, target in (("halts", slows, 50.0), ("rests", rests, None)):
+    for name, values, target in (("begins to stop", slows, 50.0), ("rests", rests, None)):
         if values:
             out.append(
                 Row(

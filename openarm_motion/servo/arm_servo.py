@@ -228,7 +228,7 @@ class ArmServo:
             return self._course_of(start, velocity, 0.0)[0]
         here = around.joined({self.arm.name: start.q, **{name: rows[0] for name, rows in others.items()}})
         clear = around.free(here)
-        ends = {name: rows[[0, -1]] for name, rows in others.items()}
+        ends = {name: np.unique(rows[[0, -1]], axis=0) for name, rows in others.items()}  # one, where it rests
         near = None if clear else around.near(around.beside(self.arm.name, start.q[None], ends)[:, 0])
         kept, hit, course = 0.0, Report(), self._course_of(start, velocity, 0.0)[0]
         tried = min(self._share * _FASTER + _LEAST_SHARE, 1.0 if clear else _ESCAPE)
