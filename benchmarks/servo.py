@@ -121,7 +121,7 @@ class Jogger(Observer):
         self._plain.publish(JointState(name=names, position=np.concatenate(list(q.values())).tolist()))
 
     def record(self, *, on: bool) -> None:
-        """Begin anew, or end."""
+        """Start a new recording, or stop it."""
         if on:
             self.seen = Seen()
         self._recording = on

@@ -132,6 +132,8 @@ class TrajectoryFollower(Follower):
 
     def abort(self, why: str) -> None:
         """See `Follower.abort`."""
+        if self._goal is not None:
+            self._command.velocity = np.zeros_like(self._command.velocity)
         self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, why)
 
     def stop(self, why: str) -> None:
@@ -335,7 +337,6 @@ class TrajectoryFollower(Follower):
     def _finish(self, end: End, result: TrajectoryResult, text: str) -> None:
         if self._goal is not None:
             done, self._goal = self._goal.done, None
-            self._command.velocity = np.zeros_like(self._command.velocity)
             done(TrajectoryOutcome(end, result, text))
 
 

@@ -30,7 +30,7 @@ from openarm_grasp.sampling.surface import Surface
 
 #: Leaning away from the shoulder reaches furthest; as of the grasps of boxes.
 _SIDE_WEIGHT = 0.15
-#: A grasp that is searched anew at the second look is this near to the one before it, m, rad.
+#: A grasp that is searched at the second look is this near to the one before it, m, rad.
 _AROUND, _TURNED = 0.03, radians(30.0)
 
 

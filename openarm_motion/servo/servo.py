@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Servoing of all arms of a motion service: who may command them, what they are told, and why they slow or stop."""
+"""Servoing of all arms of a motion service: who may command them, their set points, and why they slow or stop."""
 
 from __future__ import annotations
 
@@ -221,9 +221,9 @@ class Servo:
                 self._around = None
             raise
 
-    # --- what is told
+    # --- set points
     def fail(self, why: str) -> None:
-        """Tell the arms nothing more, because something is wrong here; what they were told last ends at rest."""
+        """Send no more set points, because something is wrong here; the last trajectories end at rest."""
         with self._lock:
             self._started.clear()
             for name in sorted(self._claimed):
@@ -233,7 +233,7 @@ class Servo:
             self._claimed.clear()
 
     def tick(self, wall: float) -> None:
-        """Tell every arm that is commanded its next set point; at the pace of `publish_period`.
+        """Send every arm that is commanded its next set point; at the pace of `publish_period`.
 
         Args:
             wall: Present time, s.
@@ -260,9 +260,9 @@ class Servo:
         if around is not None and age <= _STALE:
             others = {other: self._others(other, now_ns) for other in around.names if other != name}
             measured = self._positions(name)
-            told = arm.tick(now_ns, wall, (stamp_ns, measured), around, others)
-            if told is not None:
-                self._send(name, *told)
+            found = arm.tick(now_ns, wall, (stamp_ns, measured), around, others)
+            if found is not None:
+                self._send(name, *found)
         else:
             arm.drop()  # the last trajectory ends at rest
         if why:

@@ -58,7 +58,7 @@ class Surroundings:
             now: Joints, planning scene and map.
             held: What each arm holds, tool frame.
             clearance: Distances to keep.
-            lag: Joints may be this far from where they are told to be, rad; what that moves is kept in addition.
+            lag: Joints may be this far from their set points, rad; what that moves is kept in addition.
         """
         environment = now.environment
         if len(arms) == 2:
@@ -81,8 +81,8 @@ class Surroundings:
         each = [np.broadcast_to(np.atleast_2d(parts[name]), (rows, parts[name].shape[-1])) for name in self.names]
         return np.hstack(each)
 
-    def beside(self, name: str, path: Array, others: Mapping[str, Array]) -> Array:
-        """Configurations (k, m, n) of all arms: one on its path (m, i) beside each of up to k positions of the others.
+    def combined(self, name: str, path: Array, others: Mapping[str, Array]) -> Array:
+        """Configurations (k, m, n) of all arms: one on its path (m, i), with each of up to k positions of the others.
 
         Args:
             name: The arm.
@@ -106,13 +106,13 @@ class Surroundings:
         """What is too near at configurations (m, n): by pair, its distance, m. An exact check takes 0.8 ms."""
         return [{_pair(contact): contact.distance for contact in self.exact.contacts(q)} for q in states]
 
-    def no_nearer(self, states: Array, before: Sequence[Near]) -> bool:
-        """Whether at configurations (m, n) nothing is nearer than it may, or than it was before, from `near`."""
-        for q, allowed in zip(states, before, strict=True):
-            for contact in self.exact.contacts(q):
-                if contact.distance < allowed.get(_pair(contact), np.inf) - _SLACK:
-                    return False
-        return True
+    def no_nearer(self, states: Array, before: Near) -> bool:
+        """Whether at configurations (m, n) nothing is nearer than it may be, or than it was before."""
+        return not any(
+            contact.distance < before.get(_pair(contact), np.inf) - _SLACK
+            for q in states
+            for contact in self.exact.contacts(q)
+        )
 
     def contact(self, path: Array) -> Contact | None:
         """The first pair on configurations (m, n) that is too near."""

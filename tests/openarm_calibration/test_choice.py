@@ -53,7 +53,7 @@ MADE: dict[str, Callable[[np.random.Generator], Truth]] = {
 
 @pytest.mark.parametrize("kind", list(MADE))
 def test_no_closed_form_predicts_poses_that_were_left_out_better(kind: str) -> None:
-    """Every pose of some sets left out in turn, the model chosen anew each time: in px, at the board and in angle.
+    """Every pose of some sets left out in turn, the model chosen each time: in px, at the board and in angle.
 
     The peer is the best of the seven in each column by itself, chosen afterwards. Errors of the clumsy robot are not
     normal, as the model has them: there to the 3 % that so few poses can tell.

@@ -9,7 +9,7 @@ import pytest
 from openarm_common.collision.held_apart import held_apart
 from openarm_common.robot.description import RobotDescription
 
-#: A flat arm: `tip` turns on `arm` about z, at `gap` beside the post; a second joint turns `post` where it is.
+#: A flat arm: `tip` turns on `arm` about z, at `gap` next to the post; a second joint turns `post` where it is.
 _URDF = """<robot name="flat">
  <link name="base"/>
  <link name="post"><collision name="post"><geometry><sphere radius="0.05"/></geometry></collision></link>

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from openarm_common.errors import Code
 from openarm_common.robot.servos import ServoModel
-from openarm_control.arm import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
+from openarm_control.arm import End, FollowerState, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
 from openarm_control.carrier import Carrier, CarrierConfig
 from openarm_control.follower import Tracker
 from openarm_control.trajectory import (
@@ -214,6 +214,26 @@ def test_a_new_trajectory_takes_over_without_a_jump() -> None:
     assert arm.run().end is End.SUCCEEDED
     np.testing.assert_allclose(arm.q, [0.0, 0.3])
     assert np.abs(np.diff(np.array(arm.history), n=2, axis=0)).max() < 0.0015
+
+
+def test_trajectories_that_replace_each_other_keep_the_velocity_of_the_reference() -> None:
+    """As servoing streams them: a reference that rests for a tick at each would brake the arm, and hold it back."""
+    arm = Arm()
+    ahead, states = 0.05 * np.arange(1, 8), list[FollowerState]()
+    for k in range(40):
+        q = 0.004 * k + 0.4 * ahead
+        v = np.full((7, 2), 0.4)
+        v[-1] = 0.0
+        for _ in range(2):  # two of them between ticks are one
+            arm.start(t=ahead, q=np.stack([q, -q], axis=1), v=v * [1.0, -1.0], start_ns=arm.t_ns)
+        arm.tick()
+        assert arm.follower.state is not None
+        states.append(arm.follower.state)
+    velocity = np.array([state.desired_velocity for state in states[10:]])
+    np.testing.assert_allclose(velocity, np.tile([0.4, -0.4], (30, 1)), atol=0.02)
+    arm.follower.abort("the end")
+    arm.tick()
+    np.testing.assert_array_equal(arm.follower.state.desired_velocity, 0.0)
 
 
 def test_a_refused_trajectory_leaves_the_running_one_alone() -> None:

@@ -8,7 +8,7 @@ import { OrbitControls } from "./vendor/OrbitControls.js";
 THREE.ColorManagement.enabled = false; // colours are shown as they are given
 const FOVY = 0.7;
 const START = { eye: [1.314, -1.154, 1.259], target: [0.3, 0, 0.42] };
-const WORK = new THREE.Box3(new THREE.Vector3(0.1, -0.35, 0.3), new THREE.Vector3(0.7, 0.35, 0.6)); // shown beside the robot
+const WORK = new THREE.Box3(new THREE.Vector3(0.1, -0.35, 0.3), new THREE.Vector3(0.7, 0.35, 0.6)); // in view with the robot
 const SHAPES = {
   box: new THREE.BoxGeometry(),
   cylinder: new THREE.CylinderGeometry(0.5, 0.5, 1, 28).rotateX(Math.PI / 2),

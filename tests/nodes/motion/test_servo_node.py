@@ -23,12 +23,12 @@ class Client:
         self.bench, self.ros, self.node = bench, bench.ros, bench.ros.node
         self.name = f"{prefix}/servo_node"
         self.said: list[ServoStatus] = []
-        self.told: list[JointTrajectory] = []
+        self.sent: list[JointTrajectory] = []
         self.twists = self.node.create_publisher(TwistStamped, f"{self.name}/delta_twist_cmds", 10)
         self.jogs = self.node.create_publisher(JointJog, f"{self.name}/delta_joint_cmds", 10)
         self.node.create_subscription(ServoStatus, f"{self.name}/status", self.said.append, 10)
         topic = "/right_joint_trajectory_controller/joint_trajectory"
-        self.node.create_subscription(JointTrajectory, topic, self.told.append, 10)
+        self.node.create_subscription(JointTrajectory, topic, self.sent.append, 10)
 
     def call(self, kind, name: str, request=None):
         return self.ros.call(self.node.create_client(kind, f"{self.name}/{name}"), request or kind.Request(), 30.0)
@@ -65,8 +65,8 @@ def test_commands_are_refused_before_start_and_after_stop(client: Client) -> Non
     jog = JointJog(joint_names=list(JOINTS), velocities=[0.1, 0.0])
     assert "call start_servo" in client.refusal(jog)
     assert client.call(Trigger, "start_servo").success
-    client.send(jog, lambda: bool(client.told))
-    assert client.told[-1].points[-1].velocities == pytest.approx([0.0] * 7)
+    client.send(jog, lambda: bool(client.sent))
+    assert client.sent[-1].points[-1].velocities == pytest.approx([0.0] * 7)
     assert client.call(SetBool, "pause_servo", SetBool.Request(data=True)).success
     assert "call start_servo" in client.refusal(jog)
 
