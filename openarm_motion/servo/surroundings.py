@@ -72,7 +72,9 @@ class Surroundings:
         asked.enter_context(scene.further(lag * scene.swings().sum(axis=1)))
         found = cls(tuple(arm.name for arm in arms), scene, FastScene(scene.arms, scene.arms[0].distances), asked)
         here = np.array([[now.state[joint] for arm in arms for joint in arm.names]])
-        found.free(here), found.near(here)  # the first checks take longer, and while servoing nothing may
+        # the first checks take longer, and while servoing nothing may
+        found.free(here)
+        found.near(here)
         return found
 
     def joined(self, parts: Mapping[str, Array]) -> Array:
