@@ -113,8 +113,7 @@ class Supervisor:
             stdin=asyncio.subprocess.PIPE,
             start_new_session=True,
         )
-        loop = asyncio.get_running_loop()
-        self._probe = asyncio.ensure_future(loop.run_in_executor(self._threads, self._make_probe))
+        self._open_probe()
         for keeper in self._keepers.values():
             watcher = asyncio.create_task(keeper.keep([self._keepers[need] for need in keeper.spec.needs]))
             watcher.add_done_callback(lambda task, keeper=keeper: self._watcher_ended(keeper, task))
@@ -160,7 +159,9 @@ class Supervisor:
 
     async def _hold_and_hurry(self) -> None:
         try:
-            async with asyncio.timeout(2.0 * _STOP_S):
+            async with asyncio.timeout(3.0 * _STOP_S):
+                if self._probe is None:  # closed by `stop`; this one stays until the process ends
+                    self._open_probe()
                 self.say(f"emergency stop: {await self.ask(lambda probe: probe.emergency_stop(_STOP_S))}")
         except (TimeoutError, OpenArmError, RuntimeError) as error:  # the last: everything has ended meanwhile
             self.say(f"no emergency stop: {error!r}")
@@ -170,7 +171,8 @@ class Supervisor:
         """Stop every node, dependents before their needs, and leave nothing behind.
 
         Args:
-            ends: So does this process, by `shm.leave` with the names in `left`.
+            ends: So does this process, by `shm.leave` with the names in `left`. Otherwise the probe leaves before the
+                nodes do: Fast DDS may not let a participant go whose peers have just gone, as `shm.leave` says.
         """
         self.stop_asked.set()
         await self.daemon.close()
@@ -178,7 +180,11 @@ class Supervisor:
             for watcher in self._watchers:
                 watcher.cancel()
         await asyncio.gather(*self._watchers, return_exceptions=True)
+        mapped = shm.mapped_by(os.getpid())
         stops: list[asyncio.Task[None]] = []
+        if not ends:
+            stops.append(asyncio.create_task(self._close_probe()))
+            await asyncio.wait(stops, timeout=1.0)
         for level in reversed(self.graph.levels()):
             tasks = [asyncio.create_task(self._keepers[name].stop()) for name in level]
             stops += tasks
@@ -186,10 +192,7 @@ class Supervisor:
             await asyncio.wait(tasks, timeout=1.0)
         await asyncio.gather(*stops)
         self.ports.close()
-        mapped = shm.mapped_by(os.getpid())
-        made = self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None
-        if made and not ends:
-            await self.ask(lambda probe: probe.close())
+        mapped |= shm.mapped_by(os.getpid())
         self._threads.shutdown()
         mapped |= self.daemon.mapped.union(*(keeper.mapped for keeper in self._keepers.values()))
         domain = environment.domain_id(self.graph)
@@ -230,10 +233,19 @@ class Supervisor:
         for keeper in self._keepers.values():
             await keeper.ready.wait()
 
+    def _open_probe(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._probe = asyncio.ensure_future(loop.run_in_executor(self._threads, self._make_probe))
+
+    async def _close_probe(self) -> None:
+        if self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None:
+            await self.ask(lambda probe: probe.close())
+        self._probe = None
+
     async def ask(self, question: Callable[[Probe], T]) -> T:
         """Put a question to the probe, in its thread."""
         if self._probe is None:
-            raise OpenArmError(Code.INTERNAL, "the supervisor was not started")
+            raise OpenArmError(Code.INTERNAL, "the supervisor was not started, or is stopping")
         probe = await asyncio.shield(self._probe)
         return await asyncio.get_running_loop().run_in_executor(self._threads, question, probe)
 

@@ -69,12 +69,18 @@ def toy(folder: Path, name: str, body: str = "time.sleep(60)", **fields: object)
 class Running:
     """A supervisor under test and what it has reported."""
 
-    def __init__(self, folder: Path, nodes: dict[str, NodeSpec], ladder: Ladder | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        nodes: dict[str, NodeSpec],
+        ladder: Ladder | None = None,
+        probe: FileProbe | None = None,
+    ) -> None:
         self.events: list[Event] = []
         self.supervisor = Supervisor(
             Graph(name="toy", nodes=nodes, domain=67),
             folder / "run",
-            lambda: FileProbe(folder),
+            lambda: probe or FileProbe(folder),
             listener=self.events.append,
             ladder=ladder,
             poll=0.01,
@@ -357,6 +363,25 @@ def test_stop_goes_up_the_ladder_int_term_kill(tmp_path: Path, body: str, detail
     last, seconds = asyncio.run(run_it())
     assert last.startswith(detail)
     assert seconds < 5.0
+
+
+def test_the_probe_leaves_while_the_nodes_are_still_there(tmp_path: Path) -> None:
+    """Fast DDS may hold a participant for ever whose peers have just gone."""
+
+    async def run_it() -> list[tuple[str, bool]]:
+        closed: list[tuple[str, bool]] = []
+
+        class Leaving(FileProbe):
+            def close(self) -> None:
+                closed.extend((name, not gone(run.supervisor.pid(name))) for name in run.supervisor.states())
+
+        run = Running(tmp_path, {name: toy(tmp_path, name) for name in "ab"}, probe=Leaving(tmp_path))
+        await run.supervisor.start()
+        await run.supervisor.wait_ready()
+        await run.supervisor.stop()
+        return closed
+
+    assert asyncio.run(run_it()) == [("a", True), ("b", True)]
 
 
 def test_second_ctrl_c_is_the_emergency_stop_and_cuts_the_patience_short(tmp_path: Path) -> None:

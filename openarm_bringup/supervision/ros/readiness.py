@@ -73,7 +73,7 @@ class ReadinessClient(ContextNode):
 
     def emergency_stop(self, seconds: float) -> str:
         """Let the joints hold; return the answer of who commands them, or why there is none within so long."""
-        if not self._stop.service_is_ready():
+        if not self.spin_until(self._stop.service_is_ready, seconds):
             return "no node offers /stop"
         answer = self._stop.call_async(Trigger.Request())
         if not self.spin_until(answer.done, seconds):
