@@ -76,6 +76,7 @@ class Nodes:
         #: Errors that came out of a callback, by node.
         self.errors: list[str] = []
         self.nodes: list[Any] = []
+        self._owners: list[Any] = []
         self.probe: Any = Node("probe")
         self._spin(self.probe)
         self._alive = {}
@@ -98,8 +99,9 @@ class Nodes:
             overrides = [Parameter(name, value=value) for name, value in parameters.items()]
             arguments = ["--ros-args", *remaps] if kind is ArmControl else []
             node: Any = kind(parameter_overrides=overrides, cli_args=arguments)
-            self.nodes.append(node)
-            self._spin(node)
+            self._owners.append(node)
+            self.nodes += [node, *node.companions]
+            self._spin(node, *node.companions)
         self._listen()
         #: What the page shows; polled, not spun.
         self.page: Any = Node("page")
@@ -108,9 +110,10 @@ class Nodes:
         self.polled = (self.page, *(node._driver._listener for node in self.nodes if isinstance(node, ArmControl)))
         self.layers = [make(self.page) for make in makers(RobotDescription.load(), cameras, "overhead").values()]
 
-    def _spin(self, node: Any) -> None:
+    def _spin(self, node: Any, *companions: Any) -> None:
         executor = self._executor()
-        executor.add_node(node)
+        for one in (node, *companions):
+            executor.add_node(one)
 
         def spin() -> None:
             while not self._ending:
@@ -185,7 +188,7 @@ class Nodes:
         for layer in self.layers:
             layer.close()
         self.page.destroy_node()
-        for node in self.nodes:
+        for node in self._owners:
             node.close()
             node.destroy_node()
         rclpy.try_shutdown()
@@ -336,14 +339,16 @@ class Sender:
         except _SilentError:
             handle.cancel_goal_async()
             done = _wait(result, ANSWER_S, f"no result of {name}")
-        if not getattr(done.result, "success", not getattr(done.result, "error_code", 0)):
+        code = getattr(done.result, "error_code", 0)
+        fine = code == 0 if isinstance(code, int) else code.val == code.SUCCESS
+        if not getattr(done.result, "success", fine):
             raise OpenArmError(getattr(done.result, "code", "") or "REFUSED", getattr(done.result, "message", ""))
 
     # --- parameters
     def parameter(self) -> Callable[[], object]:
         """One parameter: of a running node, or of one that starts."""
         node = self._rng.choice(self._nodes.nodes)
-        if self._rng.random() < 0.5:
+        if self._rng.random() < 0.5 and node.config.model_dump():
             return partial(self._start, node)
         return partial(self._set, node)
 
