@@ -49,6 +49,8 @@ _FLOATS = (
     float("nan"), float("inf"), float("-inf"), 1e308, -1e308, 1e-320, 0.0, -0.0, -1.0, 1.0, 1e6, 1e-9, 3.4e38, 1e18,
 )  # fmt: skip
 _LENGTHS = (0, 1, 2, 3, 7, 100, 10_000)
+#: A list that is made longer takes no more, bytes: more is refused by the sender's own middleware.
+_MOST = 32_000_000
 
 
 def plausible(kind: Any, rng: random.Random, depth: int = 0) -> Any:
@@ -112,6 +114,17 @@ def _fields(message: Any) -> Iterator[tuple[Any, str, str]]:
                 yield from _fields(one)
 
 
+def _weight(value: Any) -> int:
+    """Bytes of a value, about."""
+    if isinstance(value, str):
+        return len(value)
+    if hasattr(value, "get_fields_and_field_types"):
+        return sum(_weight(getattr(value, name)) for name in value.get_fields_and_field_types())
+    if isinstance(value, list) and value and not isinstance(value[0], int | float):
+        return sum(map(_weight, value))
+    return 8 * len(value) if hasattr(value, "__len__") else 8
+
+
 def _bad(present: Any, kind: str, rng: random.Random) -> Any:
     match = SEQUENCE.match(kind)
     if match is not None:
@@ -128,7 +141,8 @@ def _bad(present: Any, kind: str, rng: random.Random) -> Any:
             values[at] = _bad(copy.deepcopy(values[at]), inner, rng)
         else:
             one = values[0] if values else _value(None, inner, rng, 3)
-            values = [one] * (rng.choice(_LENGTHS) if "/" not in inner else rng.choice(_LENGTHS[:6]))
+            count = rng.choice(_LENGTHS) if "/" not in inner else rng.choice(_LENGTHS[:6])
+            values = [one] * min(count, _MOST // (1 + _weight(one)))
         values = values[: int(match["most"] or len(values))]
         return array.array("B", values) if inner == "uint8" else values
     if "/" in kind:
