@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+import time
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -20,7 +23,7 @@ _DRAWS = 48
 _ANYWHERE = 0.35
 
 
-def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0) -> list[Array]:
+def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0, end: float = math.inf) -> list[Array]:
     """Configurations (n,) in a region, those that are reached first come first.
 
     Args:
@@ -28,6 +31,7 @@ def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0) -> lis
         region: Where.
         start: (n,) joints that are not constrained stay as here.
         scale: Of velocity, see `StartState`.
+        end: After it, s of the monotonic clock, nothing else is drawn.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for a joint of another arm; LIMITS; UNREACHABLE, with the reason.
@@ -37,7 +41,7 @@ def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0) -> lis
         return [_joints(arm, region, start)]
     limits, margin = arm.limits(scale), arm.config.planning.joint_margin
     first: Array | None = None
-    for pose, free in _poses(arm, region, start):
+    for pose, free in itertools.islice(_poses(arm, region, start), 1 if region.one_pose else None):
         first = pose if first is None else first
         solve = arm.inverse.position_solutions if free else arm.inverse.solutions
         found = np.array([s.q for s in solve(pose, margin, start) or solve(pose, 0.0, start)]).reshape(-1, len(start))
@@ -45,6 +49,8 @@ def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0) -> lis
             found = found[~region.violations(arm.names, found, arm.kinematics.fk_many(found))]
         if len(found):
             return sorted(found, key=lambda q: segment_time(start, q, limits))
+        if time.monotonic() > end:
+            break
     why = "no pose of the region was found" if first is None else arm.inverse.why_not(first, margin, start)
     if first is not None and not why:
         why = "no configuration at the pose satisfies the other constraints"

@@ -42,7 +42,7 @@ def to_region(arm: Arm, now: StartState, goal: RegionGoal, around: RequestBoxes)
     """
     end = time.monotonic() + (goal.time_limit or arm.config.planning.time_limit)
     scene = free_scene(arm, now, around)
-    wanted = _configurations(arm, now, goal.regions)
+    wanted = _configurations(arm, now, goal.regions, end)
     free = [q for q in wanted if not scene.collides(q)]
     if not free:
         contact = scene.contacts(wanted[0])[0]
@@ -54,12 +54,12 @@ def to_region(arm: Arm, now: StartState, goal: RegionGoal, around: RequestBoxes)
     return _constrained(arm, now, scene, free, goal.path, end)
 
 
-def _configurations(arm: Arm, now: StartState, regions: Sequence[Region]) -> list[Array]:
+def _configurations(arm: Arm, now: StartState, regions: Sequence[Region], end: float) -> list[Array]:
     found: list[Array] = []
     fault: OpenArmError | None = None
     for region in regions:
         try:
-            found += in_region(arm, region, now.start, now.scale)
+            found += in_region(arm, region, now.start, now.scale, end)
         except OpenArmError as error:
             fault = fault or error.settled()
     if found:

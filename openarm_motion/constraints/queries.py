@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -47,13 +48,23 @@ def at_pose(pose: Array, more: Region) -> Region:
     return Region(more.joints, (place, *more.positions), (turn, *more.orientations))
 
 
-def solve(arm: Arm, now: StartState, around: RequestBoxes, region: Region, *, avoid_collisions: bool) -> Array:
+def solve(
+    arm: Arm, now: StartState, around: RequestBoxes, region: Region, *, avoid_collisions: bool, end: float = math.inf
+) -> Array:
     """The configuration (n,) in a region that is reached first; without collisions, where they count.
+
+    Args:
+        arm: The arm.
+        now: Where it is.
+        around: Boxes of the request.
+        region: Where it shall be.
+        avoid_collisions: Whether they count.
+        end: The search ends then, s of the monotonic clock; what is at hand is tried nevertheless.
 
     Raises:
         PlanFailedError: UNREACHABLE; IN_COLLISION, naming the pair.
     """
-    found = in_region(arm, region, now.start, now.scale)
+    found = in_region(arm, region, now.start, now.scale, end)
     if not avoid_collisions:
         return found[0]
     scene = arm.scene(now.state, around.obstacles, around.attached, environment=now.environment)

@@ -19,6 +19,8 @@ from openarm_common.types import Array
 
 #: What inverse kinematics and rounding may leave, added to every tolerance: m, rad.
 _SLACK_M, _SLACK_RAD = 1e-4, 1e-3
+#: Tolerances that make no difference to whether a pose is in reach: m, rad.
+POSE_M, POSE_RAD = 1e-3, 1e-3
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,11 @@ class Volume:
     kind: Literal["box", "sphere", "cylinder"]
     T: Array
     size: tuple[float, ...]
+
+    @property
+    def extent(self) -> float:
+        """The longest of its measures, m."""
+        return max(self.size)
 
     def excess(self, points: Array) -> Array:
         """How far each of the points (m, 3) is outside, m; 0 inside."""
@@ -134,6 +141,13 @@ class Region:
     def __bool__(self) -> bool:
         """Whether anything is constrained."""
         return bool(self.joints or self.positions or self.orientations)
+
+    @property
+    def one_pose(self) -> bool:
+        """Whether position and orientation leave nothing to choose, but for `POSE_M` and `POSE_RAD`."""
+        volumes = [volume for position in self.positions for volume in position.volumes]
+        small = len(volumes) == 1 and volumes[0].extent <= POSE_M
+        return small and any(max(one.tolerance) <= POSE_RAD for one in self.orientations)
 
     def check(self, names: Sequence[str]) -> None:
         """Refuse joints that are not among these.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision.solids import box_from
 from openarm_motion.constraints.asked import CartesianGoal, RegionGoal
 from openarm_motion.constraints.cartesian import along
+from openarm_motion.constraints.goals import in_region
 from openarm_motion.constraints.names import RobotNames
 from openarm_motion.constraints.plans import to_region
 from openarm_motion.constraints.queries import at_pose, judge
@@ -96,6 +98,25 @@ def test_a_position_alone_is_reached_in_whatever_orientation(arm, now) -> None:
     trajectory = to_region(arm, now, RegionGoal((region,)), NOTHING)
 
     assert arm.kinematics.fk(trajectory.q[-1])[:3, 3] == pytest.approx(p, abs=2e-3)
+
+
+def test_poses_are_drawn_until_the_time_is_over_and_of_one_pose_there_is_nothing_to_draw(arm, now, monkeypatch) -> None:
+    far = arm.kinematics.fk(now.start)
+    far[0, 3] += 3.0
+    place = PositionRegion("the tool", np.zeros(3), (Volume("sphere", far, (0.5,)),))
+    wide = Region(positions=(place,), orientations=at_pose(far, Region()).orientations)
+    tried: list[float] = []
+    monkeypatch.setattr(arm.inverse, "solutions", lambda *about: tried.append(0.0) or [])
+
+    def count(region: Region, end: float) -> int:
+        tried.clear()
+        with pytest.raises(OpenArmError, match="can't reach the goal"):
+            in_region(arm, region, now.start, end=end)
+        return len(tried)
+
+    once = count(at_pose(far, Region()), np.inf)
+    assert count(wide, np.inf) > 40 * once
+    assert count(wide, time.monotonic()) == once
 
 
 def test_a_path_stays_in_its_region(arm, now) -> None:

@@ -10,6 +10,7 @@ supported is refused by name (`fields`).
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -44,7 +45,7 @@ from openarm_common import se3
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import ActionServer
-from openarm_common.ros.convert import matrix_to_pose, trajectory_from_msg
+from openarm_common.ros.convert import matrix_to_pose, stamp_to_ns, trajectory_from_msg
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, BaseNode
 from openarm_motion.collision.exact import Contact, body_of
 from openarm_motion.config import MoveGroupConfig
@@ -274,8 +275,12 @@ class MoveGroupNode(BaseNode[NoParameters]):
         pose = pose @ se3.inverse(self._convert.on_tool(arm_name, asked.ik_link_name))
         region = at_pose(pose, self._convert.region(asked.constraints, arm_name))
         arm, now, around = await self._service.surroundings(arm_name, self._convert.state(asked.robot_state))
+        limit = 1e-9 * stamp_to_ns(asked.timeout) or arm.config.planning.time_limit
+        if limit < 0.0:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"timeout is {limit:g} s, expected >= 0 (0: the default)")
+        end = time.monotonic() + limit
         q = await self._service.robot.compute(
-            lambda: solve(arm, now, around, region, avoid_collisions=asked.avoid_collisions)
+            lambda: solve(arm, now, around, region, avoid_collisions=asked.avoid_collisions, end=end)
         )
         known = {name: x for name, x in now.state.items() if name in self.description.joints}
         response.solution = state_msg({**known, **dict(zip(arm.names, q.tolist(), strict=True))})

@@ -260,6 +260,8 @@ def test_ik_and_fk_are_each_others_inverse(client: Client) -> None:
     assert client.call(GetPositionFK, "/compute_fk", fk).error_code.val == Codes.INVALID_LINK_NAME
     request.ik_request.pose_stamped.pose.position.x += 5.0
     assert client.call(GetPositionIK, "/compute_ik", request).error_code.val == Codes.NO_IK_SOLUTION
+    request.ik_request.timeout.sec = -1
+    assert "timeout is -1 s, expected >= 0" in client.call(GetPositionIK, "/compute_ik", request).error_code.message
 
 
 def test_a_state_is_judged_with_its_contacts(client: Client) -> None:
