@@ -244,6 +244,19 @@ def test_a_straight_line_is_followed_as_far_as_it_goes(client: Client) -> None:
     assert part.error_code.message
 
 
+def test_a_workspace_bounds_the_base_of_the_robot(client: Client) -> None:
+    request = client.joint_goal(client.named())
+    low, high = request.workspace_parameters.min_corner, request.workspace_parameters.max_corner
+    low.x, low.y, low.z, high.x, high.y, high.z = 0.2, -1.0, -1.0, 1.0, 1.0, 1.0
+    refused = client.plan(request)
+    low.x = -0.2
+    planned = client.plan(request)
+
+    assert refused.error_code.val == Codes.FAILURE
+    assert "leave the robot's base out" in refused.error_code.message
+    assert planned.error_code.val == Codes.SUCCESS, planned.error_code.message
+
+
 def test_ik_and_fk_are_each_others_inverse(client: Client) -> None:
     T = client.arm.kinematics.fk(client.named())
     request = GetPositionIK.Request()

@@ -111,3 +111,14 @@ def test_an_arm_that_a_goal_moves_is_not_servoed(client: Client) -> None:
     assert client.call(Trigger, "start_servo").success
     with service.claims.holding("right", wanted=True):
         assert "moving already" in client.refusal(JointJog(joint_names=[JOINTS[0]], velocities=[0.1]))
+
+
+def test_a_goal_to_an_arm_that_is_servoed_is_refused(client: Client) -> None:
+    jog = JointJog(joint_names=[JOINTS[0]], velocities=[0.1])
+    assert client.call(Trigger, "start_servo").success
+    client.send(jog, lambda: bool(client.sent))
+    _, future = client.bench.start(client.bench.move_client, client.bench.named("right"))
+    client.send(jog, future.done)
+    result = future.result().result
+    assert result.code == "BUSY"
+    assert "is moved by servoing" in result.message
