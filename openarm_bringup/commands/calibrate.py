@@ -19,7 +19,7 @@ from openarm_bringup.calibration.source import (
     with_solved,
     zeros_in,
 )
-from openarm_bringup.commands import calibrate_foreign, calibrate_live, calibrate_zeros
+from openarm_bringup.commands import calibrate_foreign, calibrate_live, calibrate_touch, calibrate_zeros
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.zeros import REAL
@@ -32,6 +32,7 @@ calibrate = App(name="calibrate", help="Hand-eye calibration: boards, sampling, 
 
 calibrate.command(calibrate_live.auto)
 calibrate.command(calibrate_live.sample)
+calibrate.command(calibrate_touch.touch)
 calibrate.command(calibrate_live.table)
 calibrate.command(calibrate_live.dynamics)
 calibrate.command(calibrate_zeros.zeros)
@@ -81,13 +82,32 @@ def solve(
 
 
 @calibrate.command
-def check(samples: Path, *, source: Source = ALL_SAMPLES) -> Outcome:
+def check(
+    samples: Path,
+    *,
+    touches: Path | None = None,
+    tip: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    steady: float = 1e-3,
+    source: Source = ALL_SAMPLES,
+) -> Outcome:
     """Validate a session file or a bag, and its distance from what is stored; exit code 1 when it fails the limits.
+
+    With touches, the tip of a hand also has to meet the marks where the camera sees them: a second evidence, of joints
+    alone. The board must not have moved since the samples.
 
     Args:
         samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
+        touches: CSV file of `openarm calibrate touch`.
+        tip: That touched, in the frame of the tool centre point, m.
+        steady: Standard deviation of a touch by axis, m.
     """
-    return with_solved(samples, source, lambda done: _outcome(done, None))
+    compare = calibrate_touch.comparison(touches, tip, steady) if touches is not None else None
+
+    def said(done: Solved) -> Outcome:
+        outcome = _outcome(done, None)
+        return outcome if compare is None else compare(done, outcome)
+
+    return with_solved(samples, source, said)
 
 
 @calibrate.command
