@@ -253,7 +253,7 @@ class LimitsConfig(Config):
     joint_state_timeout: float = Field(
         default=1.0, gt=0.0, le=10.0, description="silent joints = robot lost, wall clock, s"
     )
-    ready_timeout: float = Field(default=3.0, ge=0.0, le=60.0, description="wait for the other nodes, wall clock, s")
+    ready_timeout: float = Field(default=8.0, ge=0.0, le=60.0, description="wait for the other nodes, wall clock, s")
     answer_timeout: float = Field(
         default=5.0, gt=0.0, le=60.0, description="an action server accepts within, wall clock, s"
     )

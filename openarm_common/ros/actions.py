@@ -123,8 +123,8 @@ def _participant(info: TopicEndpointInfo) -> str:
 class Watch:
     """Notices when the publisher of a topic dies, which discovery says up to 20 s later.
 
-    Without a sign of life it counts as dead, unless its process is of this machine and lives: then after `_SILENT_S`
-    more of silence.
+    A process of this machine that ends counts as dead at once. One without a sign of life does, too, unless its process
+    is of this machine and lives: then after `_SILENT_S` more of silence.
 
     Args:
         node: Owner.
@@ -140,6 +140,9 @@ class Watch:
         self._who = ""
         self._participants = set[str]()
         self._buried = set[str]()
+        self._watched = set[str]()
+        #: Deaths that lifelines have said, and liveliness has not.
+        self._foretold = 0
         #: Since when there has been no sign of life of a process that lives, monotonic; infinite: there is.
         self._silent_since = math.inf
         events = SubscriptionEventCallbacks(liveliness=self._on_liveliness, use_default_callbacks=False)
@@ -154,6 +157,11 @@ class Watch:
     def begin(self) -> Callable[[], str]:
         """Return a function that says who has died since this call: the node's name; "" while it lives."""
         self._look()
+        known = self._participants - self._buried
+        if len(known) >= self.alive:
+            self._foretold = 0
+        for participant in known:
+            self._watch(participant)
         before = self.deaths
 
         def died() -> str:
@@ -166,7 +174,7 @@ class Watch:
     def dead(self) -> bool:
         """Whether there was a publisher, and there is none that lives."""
         self._judge_silence()
-        return not self.alive and bool(self.deaths)
+        return self.alive <= self._foretold and bool(self.deaths)
 
     def _judge_silence(self) -> None:
         """Count one that has been silent for too long as dead."""
@@ -177,24 +185,33 @@ class Watch:
 
     def _on_liveliness(self, event: QoSLivelinessChangedInfo) -> None:
         self._look()
-        lost, self.alive = event.alive_count < self.alive, event.alive_count
-        if not lost:
+        lost, self.alive = self.alive - event.alive_count, event.alive_count
+        if lost <= 0:
             self._silent_since = math.inf
+            return
+        foretold = min(lost, self._foretold)
+        self._foretold -= foretold
+        if lost == foretold:
             return
         known = self._participants - self._buried
         dead = {participant for participant in known if not lives(participant)}
         if known and not dead:
             self._silent_since = time.monotonic()
             for participant in known:
-                watch(participant, partial(self._bury, participant))
+                self._watch(participant)
         else:
             self._buried |= dead
             self.deaths += 1
 
+    def _watch(self, participant: str) -> None:
+        if participant not in self._watched and watch(participant, partial(self._bury, participant)):
+            self._watched.add(participant)
+
     def _bury(self, participant: str) -> None:
-        """Count the end of a process that was silent before; in a thread of its own."""
-        if participant not in self._buried and self._silent_since < math.inf:
+        """Count the end of a process; in a thread of its own."""
+        if participant not in self._buried:
             self._buried.add(participant)
+            self._foretold += 1
             self.deaths += 1
 
     def _look(self) -> None:
