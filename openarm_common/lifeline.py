@@ -13,6 +13,9 @@ import socket
 import threading
 from collections.abc import Callable
 
+#: Connections that a lifeline may have, also those of processes that have ended: beyond it a lease must do.
+_WATCHERS = 4096
+
 
 def _address(name: str) -> bytes:
     return b"\0openarm_lifeline_" + name.encode()
@@ -28,7 +31,7 @@ class Lifeline:
     def __init__(self, name: str) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.bind(_address(name))
-        self._socket.listen()
+        self._socket.listen(_WATCHERS)
 
     def close(self) -> None:
         """End it."""
