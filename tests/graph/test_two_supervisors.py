@@ -80,7 +80,7 @@ def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_hold
         doctor = pool.submit(control.openarm, "doctor", "--json")
         began = time.monotonic()
         again = client.pick("blue")
-        assert time.monotonic() - began < 6.0
+        assert time.monotonic() - began < 11.0, "limits.ready_timeout is 8 s"
         assert again.code == Code.NOT_READY, f"{again.code}: {again.message}"
         assert "/detections_3d" in again.message
         findings = json.loads(doctor.result().stdout)["findings"]
