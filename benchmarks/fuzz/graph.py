@@ -75,8 +75,7 @@ class Nodes:
         self._threads: list[threading.Thread] = []
         #: Errors that came out of a callback, by node.
         self.errors: list[str] = []
-        self.nodes: list[Any] = []
-        self._owners: list[Any] = []
+        self.nodes, self._owners = list[Any](), list[Any]()
         self.probe: Any = Node("probe")
         self._spin(self.probe)
         self._alive = {}
@@ -341,9 +340,8 @@ class Sender:
         except _SilentError:
             self._begun(handle.cancel_goal_async)
             done = _wait(result, ANSWER_S, f"no result of {name}")
-        code = getattr(done.result, "error_code", 0)
-        fine = code == 0 if isinstance(code, int) else code.val == code.SUCCESS
-        if not getattr(done.result, "success", fine):
+        code = getattr(done.result, "error_code", 0)  # a number of control_msgs, or MoveIt's message
+        if not getattr(done.result, "success", code == 0 if isinstance(code, int) else code.val == code.SUCCESS):
             raise OpenArmError(getattr(done.result, "code", "") or "REFUSED", getattr(done.result, "message", ""))
 
     def _begun(self, ask: Callable[..., Any], *args: Any) -> Any:

@@ -57,7 +57,7 @@ def solve(
         arm: The arm.
         now: Where it is.
         around: Boxes of the request.
-        region: Where it shall be.
+        region: The goal.
         avoid_collisions: Whether they count.
         end: The search ends then, s of the monotonic clock; what is at hand is tried nevertheless.
 
