@@ -46,6 +46,10 @@ class Described:
         return tuple(dict.fromkeys(attribute for attribute in every if attribute))
 
 
+#: Name of what is found without knowing what it is.
+ANYTHING = "anything"
+
+
 @dataclass(frozen=True, eq=False)
 class Detection(Described):
     """One object in one image.
@@ -57,7 +61,7 @@ class Detection(Described):
         size: (3,) full edges, m.
         round: Whether it is a circle seen from above: its yaw means nothing, and a hand may approach from any side.
         measured: Whether the box is that of the object. If not, it encloses what is visible of the object: an obstacle,
-            but no target.
+            and a target only where nothing is known of the object but its points.
         code: Why it was not measured: NOTHING_DETECTED (hidden, or cut by the border of the image), or a mismatch.
     """
 
@@ -70,6 +74,11 @@ class Detection(Described):
     measured: bool = True
     code: Code = Code.NOTHING_DETECTED
     color: str = ""
+
+    @property
+    def in_part(self) -> bool:
+        """Whether only a part of something of unknown shape is seen: the rest is hidden, or beyond the border."""
+        return self.name == ANYTHING and not self.measured and self.code is Code.NOTHING_DETECTED
 
     @property
     def p_base(self) -> Array:

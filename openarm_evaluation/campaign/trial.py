@@ -222,7 +222,10 @@ class Trials:
 
     # --- after it
     def _trial(self, asked: str, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
-        """Judge the object that was asked for; where there are several, the one that went highest."""
+        """Judge the object that was asked for; where there are several, that which was taken.
+
+        Of those that were lifted it is the one that is nearest to where it was put, else the one that went highest.
+        """
         robot, task, end_ns = self.robot, self._task, self.robot.t_ns
         names: list[str] = []
         with suppress(OpenArmError):  # what the scene has not is asked for, too
@@ -233,6 +236,9 @@ class Trials:
         where, seen = outcome.place_position, outcome.object_position
         xy = (where[0], where[1]) if any(where) else (math.nan, math.nan)
         name = max(names, key=lambda n: rise_of(robot.tracks[n]))
+        lifted = [n for n in names if rise_of(robot.tracks[n]) >= RULES.lift]
+        if lifted and any(where):
+            name = min(lifted, key=lambda n: math.dist(robot.tracks[n][-1].p_world[:2], xy))
         if seen is not None and not outcome.attempts:  # nothing rose: that which was looked at
             name = min(names, key=lambda n: float(np.linalg.norm(robot.tracks[n][0].p_world - np.array(seen))))
         any_shape = task.scene.object(name).shape == "mesh"

@@ -30,6 +30,8 @@ _SAME_THING = 0.3
 _LOWER, _LOWER_SHARE = 0.015, 0.25
 #: Of the points of a thing that has not moved so many lie where it was, %: the rest may be the edge of the hand.
 _MOST = 85.0
+#: What a camera over the table sees of a thing wherever it stands: the highest point in each cell of this edge, m.
+_CELL = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,7 @@ class Cluster:
         extent: Largest horizontal distance between two of its points, about.
         points: How many.
         cut: Whether the border of the image, the robot or another thing cuts it.
+        upper: (n, 3) its highest points, seen from above; None: they are not known.
     """
 
     centroid: Array
@@ -49,6 +52,7 @@ class Cluster:
     extent: float
     points: int
     cut: bool = False
+    upper: Array | None = None
 
     @classmethod
     def of(cls, points: Array, *, cut: bool = False) -> Cluster:
@@ -66,7 +70,14 @@ class Cluster:
         # a few points that fly make neither the top nor the extent
         top = float(np.percentile(flat[:, 2], 98.0))
         extent = float(np.ptp(np.percentile(along, (1.0, 99.0), axis=0), axis=0).max())
-        return cls(flat.mean(axis=0), top, extent, len(flat), cut)
+        return cls(flat.mean(axis=0), top, extent, len(flat), cut, _upper(flat))
+
+    def stands_where(self, before: Cluster) -> bool:
+        """Whether most of what was seen of a thing before is where this is now; taken for so, where it is not known."""
+        if self.upper is None or before.upper is None:
+            return True
+        away, _ = KDTree(self.upper).query(before.upper)
+        return float(np.median(away)) <= 2.0 * _CELL
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +120,11 @@ def judge_gone(
             if risen >= config.rise:
                 highest = max(highest, risen)
             # what it lay on, or leant against, shows when it has gone, and is lower
-            elif away <= match_radius and -risen <= max(_LOWER, _LOWER_SHARE * (before.top - _floor(before))):
+            elif (
+                away <= match_radius
+                and -risen <= max(_LOWER, _LOWER_SHARE * (before.top - _floor(before)))
+                and cluster.stands_where(before)
+            ):
                 text = f"something of its height still stands at its place ({away * 1e3:.0f} mm from it)"
                 return CameraVerdict(Code.GRASP_MISSED, text)
     text = f", and is seen {highest * 1e3:.0f} mm higher" if highest else ""
@@ -153,6 +168,35 @@ def judge_unmoved(before: Array, now: Array, config: HeldConfig) -> tuple[bool, 
     if off > limit:
         return False, f"the object has moved: it reaches {off:.0f} mm out of where it stood, expected {limit:.0f}"
     return True, "the object still stands there"
+
+
+def judge_moved(before: Array, T_after_before: Array, now: Array, config: HeldConfig) -> CameraVerdict:
+    """Whether what was seen of a thing is seen where the hand has moved it to; the thing may have been seen in part.
+
+    The upper side is compared: of other sides a camera over the table sees more or less from place to place.
+
+    Args:
+        before: (n, 3) points of it before the grasp.
+        T_after_before: (4, 4) how the hand has moved it.
+        now: (n, 3) points of what is seen there now.
+        config: Thresholds.
+    """
+    there = _upper(before @ T_after_before[:3, :3].T + T_after_before[:3, 3])
+    if not len(now) or not len(there):
+        return CameraVerdict(Code.PLACE_FAILED, "nothing is seen where it was put down")
+    away, _ = KDTree(now).query(there)
+    off, limit = 1e3 * float(np.percentile(away, _MOST)), 1e3 * config.moved
+    if off > limit:
+        text = f"what was seen of it is {off:.0f} mm from where it was put down, expected at most {limit:.0f} mm"
+        return CameraVerdict(Code.PLACE_FAILED, text)
+    return CameraVerdict(Code.OK, f"what was seen of it is within {off:.0f} mm of where it was put down")
+
+
+def _upper(points: Array) -> Array:
+    """Return the highest of the points (n, 3) in each cell, seen from above."""
+    order = points[np.argsort(-points[:, 2], kind="stable")]
+    _, first = np.unique(np.floor(order[:, :2] / _CELL), axis=0, return_index=True)
+    return order[first]
 
 
 def judge_rests(before: Cluster, p_expected: Array, frames: Sequence[ClusterFrame], tolerance: float) -> CameraVerdict:

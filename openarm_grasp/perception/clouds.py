@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
+from openarm_common.detection import Detection
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_grasp.evidence.shapes import Cluster, ClusterFrame
-from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart
+from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting
 from openarm_grasp.sampling.surface import View
 
 #: What is lower above the table is table, m.
@@ -60,15 +61,22 @@ def object_points(clouds: Sequence[LabelledCloud]) -> Array:
     return np.concatenate([np.empty((0, 3)), *mine])
 
 
-def points_near(frames: Sequence[Frame], sighting: Sighting) -> Array:
-    """Return the points (n, 3) of the detection nearest to an object in the newest frame; none without a cloud."""
+def nearest_to(frames: Sequence[Frame], p_base: Array) -> tuple[Detection | None, Array]:
+    """Return the detection nearest to a place in the newest frame, and its points (n, 3); none without a cloud.
+
+    Args:
+        frames: In the base frame.
+        p_base: (2,) or (3,) about the middle of it.
+    """
     frame = next((frame for frame in reversed(frames) if frame.cloud is not None), None)
-    near = [d for d in frame.detections if apart(d, sighting.target) < SAME_PLACE] if frame is not None else []
-    if frame is None or frame.cloud is None or not near:
-        return np.empty((0, 3))
-    nearest = min(near, key=lambda d: apart(d, sighting.target))
-    number = frame.detections.index(nearest) + 1
-    return frame.cloud.points[frame.cloud.labels == number].astype(np.float64)
+    if frame is None or frame.cloud is None or not frame.detections:
+        return None, np.empty((0, 3))
+    away = [float(np.linalg.norm((d.p_base - p_base)[:2])) for d in frame.detections]
+    number = int(np.argmin(away))
+    if away[number] >= SAME_PLACE:
+        return None, np.empty((0, 3))
+    points = frame.cloud.points[frame.cloud.labels == number + 1].astype(np.float64)
+    return frame.detections[number], points
 
 
 def cluster_frames(frames: Sequence[Frame], place: Array) -> tuple[ClusterFrame, ...]:

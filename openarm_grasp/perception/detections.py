@@ -137,7 +137,8 @@ def average(track: Sequence[Detection]) -> Detection:
     T, size = se3.make(se3.rot_z(yaw), p), np.mean(sizes, axis=0)
     # what seems a prism in some frames alone is none
     kind = reference.kind if all(d.kind for d in track) else ""
-    return replace(reference, score=score, T_base_object=T, size=size, round=around, kind=kind)
+    measured = all(d.measured for d in track)
+    return replace(reference, score=score, T_base_object=T, size=size, round=around, kind=kind, measured=measured)
 
 
 def in_view(frames: Sequence[Frame], label: str) -> tuple[Detection, ...]:
@@ -179,24 +180,20 @@ def find(
         same: The object as it was seen or left before: it is looked for alone, whatever the words fit now.
 
     Raises:
-        OpenArmError: NOTHING_DETECTED, when no frame holds anything, or the chosen one cannot be measured;
+        OpenArmError: NOTHING_DETECTED, when no frame holds anything, or the chosen one cannot be measured, unless it
+            is a part of something of unknown shape whose points are known;
             INTRINSICS_MISMATCH or TABLE_MISMATCH, when what its camera sees is not to be trusted;
             UNKNOWN_OBJECT, naming what is in view; STALE_DATA, when the object was not in the newest frame and two
             thirds of all, or moved between them.
     """
     anchor = _same(frames, same) if same else _anchor(in_view(frames, label), label, at, exclude_near)
-    if not anchor.measured:
+    track, clouds = _track(frames, anchor, limits.match_radius, in_part=False)
+    if 3 * len(track) < 2 * len(frames):
+        parts, theirs = _track(frames, anchor, limits.match_radius, in_part=True)
+        if len(theirs) == len(parts):
+            track, clouds = parts, theirs
+    if not anchor.measured and not (anchor.in_part and track):
         raise _not_measured(anchor)
-    track: list[Detection] = []
-    clouds: list[LabelledCloud] = []
-    for frame in frames:
-        fit = [d for d in frame.detections if d.label == anchor.label and d.measured]
-        near = [d for d in fit if _distance(d, anchor) <= limits.match_radius]
-        if not near:
-            continue
-        track.append(min(near, key=lambda d: _distance(d, anchor)))
-        mine = _labelled(frame, track[-1])
-        clouds += [mine] if mine is not None else []
     # A detector may miss a thing in one frame; in most of them it must be in its place.
     if 3 * len(track) < 2 * len(frames):
         blurred = [f for f in frames if any(not d.measured and _same_thing(d, anchor) for d in f.detections)]
@@ -233,6 +230,23 @@ def find(
     shape = KDTree(np.concatenate(mine)) if mine else None
     others = _others(frames, target, limits.match_radius, shape)
     return Sighting(target, others, frames[-1].t_ns, tuple(clouds[-_CLOUDS:]))
+
+
+def _track(
+    frames: Sequence[Frame], anchor: Detection, radius: float, *, in_part: bool
+) -> tuple[list[Detection], list[LabelledCloud]]:
+    """The sights of one object, and their clouds; with `in_part` those that show a part of it, too."""
+    track: list[Detection] = []
+    clouds: list[LabelledCloud] = []
+    for frame in frames:
+        fit = [d for d in frame.detections if d.label == anchor.label and (d.measured or (in_part and d.in_part))]
+        near = [d for d in fit if _distance(d, anchor) <= radius]
+        if not near:
+            continue
+        track.append(min(near, key=lambda d: _distance(d, anchor)))
+        mine = _labelled(frame, track[-1])
+        clouds += [mine] if mine is not None else []
+    return track, clouds
 
 
 def _labelled(frame: Frame, detection: Detection) -> LabelledCloud | None:

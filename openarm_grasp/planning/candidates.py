@@ -244,6 +244,13 @@ def shorter(candidate: GraspCandidate) -> GraspCandidate:
     )
 
 
+def displaced(candidate: GraspCandidate, step: Array) -> GraspCandidate:
+    """The same grasp of the same object that stands elsewhere, (3,) away, base frame, m."""
+    T = se3.make(p=step)
+    held = tuple(replace(box, T_frame_box=T @ box.T_frame_box) for box in candidate.held)
+    return replace(candidate, T_base_tcp=T @ candidate.T_base_tcp, held=held)
+
+
 def hold_of(candidate: GraspCandidate) -> str:
     """The hold of a grasp, whatever its tilt: label and edge."""
     return candidate.id.rpartition("/tilt")[0]  # a label may have strokes of its own

@@ -16,10 +16,12 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, propose
+from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
+from openarm_grasp.planning.offers import offers
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import other_grasps, place_targets
 
@@ -47,6 +49,7 @@ class FeasibilityCheck:
         *,
         yaw: float | None = None,
         now: Sighting | None = None,
+        offered: tuple[GraspCandidate, ...] | None = None,
     ) -> OpenArmError | None:
         """Why an arm cannot pick the object, and put it where it is wanted; None when it can.
 
@@ -56,13 +59,14 @@ class FeasibilityCheck:
             place: Footprint centre (x, y), base frame, m; None: the grasp alone is planned.
             yaw: Of the object there; None: unconstrained.
             now: The object where it stands until then, when that is elsewhere; for a grasp alone.
+            offered: Grasps of it there; None: they are searched.
 
         Raises:
             OpenArmError: What the robot raises, when it was not found out.
         """
         try:
             if place is None:
-                await self._robot.plan_grasp(arm, self._offered(arm, found), found, now)
+                await self._robot.plan_grasp(arm, offered or offers(self._context, arm, found), found, now)
             else:
                 await self.pick_and_place(arm, found, (np.array(place[:2], dtype=np.float64),), yaw=yaw)
         except OpenArmError as error:
@@ -77,12 +81,7 @@ class FeasibilityCheck:
         Raises:
             OpenArmError: One of `NO_WAY`; what the robot raises.
         """
-        return await self._robot.plan_grasp(arm, self._offered(arm, found), found, at_height=at_height)
-
-    def _offered(self, arm: str, found: Sighting) -> tuple[GraspCandidate, ...]:
-        shoulder = self._context.shoulders.get(arm, (0.0, 0.0))
-        context = self._context
-        return propose(found.target, context.config, context.hand, shoulder_xy=shoulder, others=found.others)
+        return await self._robot.plan_grasp(arm, offers(self._context, arm, found), found, at_height=at_height)
 
     async def pick_and_place(
         self,
@@ -105,7 +104,7 @@ class FeasibilityCheck:
         Raises:
             OpenArmError: One of `NO_WAY`; what the robot raises.
         """
-        target, left = found.target, self._offered(arm, found)
+        target, left = found.target, offers(self._context, arm, found)
         refused: OpenArmError | None = None
         while True:
             try:
@@ -134,6 +133,18 @@ def standing_at(target: Detection, xy: Sequence[float] | Array, turn: float = 0.
     p = np.array([xy[0], xy[1], target.p_base[2]])
     turn = 0.0 if target.round else turn
     return replace(target, T_base_object=se3.make(se3.rot_z(turn) @ target.T_base_object[:3, :3], p))
+
+
+def seen_at(found: Sighting, xy: Sequence[float] | Array, turn: float = 0.0) -> Sighting:
+    """The object with its points as it would be observed elsewhere; as `standing_at`."""
+    there = standing_at(found.target, xy, turn)
+    T = there.T_base_object @ se3.inverse(found.target.T_base_object)
+    clouds: list[LabelledCloud] = []
+    for cloud in found.clouds:
+        points, mine = cloud.points.copy(), cloud.labels == 1
+        points[mine] = se3.apply(T, points[mine].astype(np.float64))
+        clouds.append(replace(cloud, points=points))
+    return replace(found, target=there, clouds=tuple(clouds))
 
 
 def _same(a: PlaceTarget, b: PlaceTarget, *, any_turn: bool) -> bool:

@@ -30,6 +30,8 @@ RAISE = 2.0 * SAME_POSITION
 _RAISED, _RAISED_AFTER_COLLISION = -1.6, 0.1
 #: Fingers at the same sides again, at another tilt or height.
 _SAME_SIDES = -0.3
+#: What has turned in the hand is held nearer to its weight next: after each loss the lever counts so much more.
+_LOST = 2.0
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,8 @@ def proposed(
 def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence[FailedGrasp]) -> Ways:
     """Rank grasps that a sampler has found for the next attempt: fingers go to other sides first.
 
+    What has slipped or turned in the hand is held where its weight pulls less.
+
     Args:
         offered: Best first.
         target: The object as it is seen now.
@@ -118,8 +122,10 @@ def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence
     if not failed:
         return Ways(tuple(offered), ())
     ranked: list[GraspCandidate] = []
+    lost = sum(past.code is Code.GRASP_LOST for past in failed)
     for one in offered:
         score = _SAME_SIDES * max(past.sides(one) for past in failed)
+        score += _LOST * lost * one.parts.get("lever", 0.0)
         ranked.append(replace(one, score=one.score + score, parts={**one.parts, "retry": score}))
     ranked.sort(key=lambda c: -c.score)
     again = [any(past.repeated_by(one, target) for past in failed) for one in ranked]

@@ -55,6 +55,8 @@ _LEVER = 0.005
 _WIDE, _ALIGNED = 0.020, 0.9
 #: And a width may be larger or smaller by this share: what is steep is measured too narrow, what is thin too wide.
 _SLACK = 0.08
+#: Share of the margin that is kept where there is no grasp with all of it.
+_TIGHT = 0.5
 #: What a pair without an upright hand lost against one with it.
 _NOT_UPRIGHT = 1.0
 
@@ -121,11 +123,17 @@ class Search:
         self._field = field
         step = surface.step
         self._pads, self._tips = shape.pads / step, shape.tips / step
+        self._margin = config.margin
         self._widest, self._obstacles = self._fits(shape), surface.obstacles
         self._least_cos = cos(radians(config.cone_deg))
         self._why = np.zeros(len(_WHY), np.int64)
         self._pairs = np.empty((0, 8))
         self._good = 0
+
+    @property
+    def widest(self) -> float:
+        """Width that the open hand had room around in what was searched last, m."""
+        return self._widest * self._surface.step
 
     @property
     def tried(self) -> Tried:
@@ -136,11 +144,13 @@ class Search:
     def best(self) -> tuple[Antipodal, ...]:
         """Find grasps, best first; the same for the same surface.
 
-        Where the hand has no room for any with a voxel to spare, those are searched that have none.
+        Where the hand has no room for any with a voxel to spare, those are searched that have none, and half the
+        margin beside the fingers.
         """
         found = self._best()
-        if not found and len(self._pairs):
-            self._obstacles = self._surface.tight
+        if not found:
+            self._margin *= _TIGHT
+            self._widest, self._obstacles = self._fits(self._shape), self._surface.tight
             found = self._best()
         return found
 
@@ -246,7 +256,7 @@ class Search:
 
     def _fits(self, shape: HandShape) -> float:
         """Width that a hand has room around, voxels."""
-        return 2.0 * (shape.opening - self._config.margin) / self._surface.step
+        return 2.0 * (shape.opening - self._margin) / self._surface.step
 
     def _search(self, hypotheses: Array, shape: HandShape, *, per_kind: int, enough: int) -> Array:
         """Rows of `found`, one a pose of a hand that has room; each hand may try so many poses."""

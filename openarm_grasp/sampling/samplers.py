@@ -192,7 +192,7 @@ def _search(asked: Sampling) -> tuple[Search, Surface]:
 def _none(search: Search, asked: Sampling, surface: Surface) -> OpenArmError:
     """Why there is no grasp: no two sides that the hand fits around, or no room for it."""
     label, tried = asked.target.label, search.tried
-    widest = 2.0 * (asked.hand.opening - asked.config.cloud.margin) * 1e3
+    widest = search.widest * 1e3
     size = " × ".join(f"{v * 1e3:.0f}" for v in np.ptp(surface.solid, axis=0) + surface.step)
     if not tried.pairs:
         return OpenArmError(

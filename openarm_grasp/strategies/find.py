@@ -128,7 +128,7 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
     if kept is not None:
         newest = frames[-1]
         others = (d for d in newest.detections if d.label != kept.sighting.target.label)
-        sighting = Sighting(kept.sighting.target, _standing(others, top_z), newest.t_ns)
+        sighting = replace(kept.sighting, others=_standing(others, top_z), t_ns=newest.t_ns)
     else:
         try:
             found = request.find(frames, limits)

@@ -22,7 +22,7 @@ from openarm_grasp.config import HandOverConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import PlaceTarget
-from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
+from openarm_grasp.planning.feasibility import FeasibilityCheck, seen_at
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import clear_spots, grid
 from openarm_grasp.requests.request import Feasible, GraspOutcome
@@ -84,7 +84,7 @@ async def hand_over(task: Task) -> GraspOutcome | None:
         if not brought.success:
             return replace(brought, message=f"on the way to the middle: {brought.message}")
         task.displaced = f"brought to the middle{again}"
-        there = replace(found, target=standing_at(found.target, way.spot))
+        there = seen_at(found, way.spot)
         take = replace(asked.about(there), arm=way.taker, why=f"hand-over, 2 of 2: {way}")
         taken = await pick_and_place(task, take)
         if taken.success:
@@ -154,11 +154,11 @@ async def _between(task: Task, seen: Sighting, giver: str, taker: str, spots: Se
                 raise
             break
         found = HandOver(giver, taker, way.position[:2], seen.target.yaw + way.yaw_offset)
-        there = standing_at(seen.target, way.position, way.yaw_offset)
+        there = seen_at(seen, way.position, way.yaw_offset)
         refusal, copes = None, -1
-        for target in (there, *_around(there, config)):
+        for stands in (there, *_around(there, config)):
             copes += 1
-            refusal = await feasible.refusal(taker, replace(seen, target=target), asked.place, yaw=asked.place_yaw)
+            refusal = await feasible.refusal(taker, stands, asked.place, yaw=asked.place_yaw)
             if refusal is not None:
                 break
         if refusal is None:
@@ -172,8 +172,8 @@ async def _between(task: Task, seen: Sighting, giver: str, taker: str, spots: Se
     raise OpenArmError(Code.NO_PLAN, f"the {taker} arm could not go on from {len(useless)} places: {fault}")
 
 
-def _around(there: Detection, config: HandOverConfig) -> tuple[Detection, ...]:
+def _around(there: Sighting, config: HandOverConfig) -> tuple[Sighting, ...]:
     """The object as it may stand instead: a little off to each side, and turned."""
     off, turn = config.margin, radians(config.margin_deg)
     ways = ((off, 0.0, turn), (-off, 0.0, -turn), (0.0, off, -turn), (0.0, -off, turn)) if off or turn else ()
-    return tuple(standing_at(there, there.p_base[:2] + np.array([dx, dy]), by) for dx, dy, by in ways)
+    return tuple(seen_at(there, there.target.p_base[:2] + np.array([dx, dy]), by) for dx, dy, by in ways)

@@ -13,14 +13,17 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
-from openarm_grasp.evidence.shapes import judge_gone, judge_held, judge_rests, judge_unmoved
+from openarm_grasp.evidence.shapes import judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
-from openarm_grasp.perception.clouds import cluster_frames, cluster_of, object_points, points_near, risen_points
+from openarm_grasp.perception.clouds import cluster_frames, cluster_of, nearest_to, object_points, risen_points
 from openarm_grasp.perception.detections import SAME_PLACE, Frame, apart
 from openarm_grasp.planning.candidates import PlaceTarget, held_boxes
 from openarm_grasp.planning.place import place_targets, placing_error
@@ -215,7 +218,8 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[
 def _still(grasp: Grasp, frames: Sequence[Frame], config: GraspConfig) -> tuple[bool, str]:
     """Whether the object still stands where it was seen; of what is no box, the points are compared."""
     if grasp.of_cloud:
-        return judge_unmoved(object_points(grasp.sighting.clouds), points_near(frames, grasp.sighting), config.held)
+        _, now = nearest_to(frames, grasp.sighting.target.p_base)
+        return judge_unmoved(object_points(grasp.sighting.clouds), now, config.held)
     return verdicts.judge_still(grasp.sighting.target, frames, config.held)
 
 
@@ -386,6 +390,8 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
         before = cluster_of(grasp.sighting)
         T_base_now = placed.target.T_base_tcp @ se3.inverse(grasp.candidate.T_base_tcp)
         rests = se3.apply(T_base_now, before.centroid)
+        if before.cut:
+            return _verify_part(run, grasp, placed, frames, T_base_now)
         seen = judge_rests(before, rests, cluster_frames(frames, rests), config.place.tolerance)
         torn = next((d for d in grasp.sighting.others if d.measured and _gone(d, frames)), None)
         if seen.ok and torn is not None:
@@ -400,6 +406,31 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
     height, footprint = (None, None) if run.size is None else (float(run.size[2]), run.size[:2])
     tolerance = config.place.tolerance
     return verdicts.judge_place(run.label, p_target, frames, tolerance, yaw, height, footprint)
+
+
+def _verify_part(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame], T_base_now: Array) -> CameraVerdict:
+    """Judge what was seen in part before the grasp, now that all of it can be seen.
+
+    Where no place was asked for, it is where it is seen to stand.
+    """
+    before = object_points(grasp.sighting.clouds[-1:])
+    middle = se3.apply(T_base_now, grasp.sighting.target.p_base)
+    now, points = nearest_to(frames, middle)
+    seen = judge_moved(before, T_base_now, points, run.config.held)
+    if not seen.ok or now is None:
+        return seen
+    if not now.measured:
+        text = "the border of the image or another thing hides a part of it: it is not known where its middle is"
+        return CameraVerdict(Code.PLACE_FAILED, text)
+    x, y = (float(v) for v in now.p_base[:2])
+    if run.request.place is None and not run.request.place_choices:
+        run.place_target = replace(placed.target, position=np.array([x, y, placed.target.position[2]]))
+        return seen
+    off, limit = float(np.linalg.norm((now.p_base - placed.target.position)[:2])), run.config.place.tolerance
+    if off > limit:
+        text = f"its middle, which was not in view before, is {off * 1e3:.0f} mm from its target"
+        return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {limit * 1e3:.0f} mm")
+    return seen
 
 
 def _gone(other: Detection, frames: Sequence[Frame]) -> bool:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Push an object into reach: a closed hand behind it, low, along a straight line, and an observation afterwards.
+"""Push an object into reach, or away from its neighbours.
+
+A closed hand goes behind it, low, and along a straight line; an observation follows.
 
 A hand comes to more places than it can grasp at: a grasp also needs room above, and one of a few yaws. Where an object
 can be pushed is not written down but planned: the way behind the object, straight down, and the line itself, with the
@@ -8,7 +10,7 @@ object as what the hand carries, so that both keep clear of everything else. Bas
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -25,8 +27,9 @@ from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.candidates import UP, GraspCandidate, tips_height
-from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
+from openarm_grasp.planning.candidates import UP, GraspCandidate, displaced, tips_height
+from openarm_grasp.planning.feasibility import FeasibilityCheck, seen_at
+from openarm_grasp.planning.offers import offers
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.confirm import PUSH, agree
 from openarm_grasp.requests.request import Feasible, GraspOutcome
@@ -72,6 +75,8 @@ async def push(task: Task) -> GraspOutcome | None:
         return None
     for number in range(1, task.context.config.push.most + 1):
         found = task.findings.need_sighting()
+        if not found.target.measured:
+            return None  # how far it reaches is not known
         try:
             planned = await plan_push(task, found)
         except OpenArmError as error:
@@ -105,10 +110,12 @@ async def plan_push(task: Task, found: Sighting) -> Push:
         OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
     """
     faults: list[str] = []
+    alone = _alone(found)
+    ways = {arm: offers(task.context, arm, alone) for arm in task.context.shoulders}
     for end in destinations(found.target, found.others, task.context):
         x, y = end
         try:
-            return await _push_to(task, found, end, await _taker(task, found, end))
+            return await _push_to(task, found, end, await _taker(task, found, end, ways))
         except OpenArmError as error:
             if error.code not in NO_WAY:
                 raise
@@ -117,12 +124,19 @@ async def plan_push(task: Task, found: Sighting) -> Push:
     raise OpenArmError(Code.UNREACHABLE, f"it cannot be pushed into reach either: {why}")
 
 
-async def _taker(task: Task, found: Sighting, end: Array) -> str:
-    """The arm that grasps the object there."""
+def _alone(found: Sighting) -> Sighting:
+    """The object without its neighbours: grasps of it are the same wherever it stands alone."""
+    clouds = (replace(c, points=c.points[c.labels != 2], labels=c.labels[c.labels != 2]) for c in found.clouds)
+    return replace(found, others=(), clouds=tuple(clouds))
+
+
+async def _taker(task: Task, found: Sighting, end: Array, ways: Mapping[str, tuple[GraspCandidate, ...]]) -> str:
+    """The arm that grasps the object there, by its grasps where the object stands now."""
     feasible, fault = FeasibilityCheck(task.robot, task.context), OpenArmError(Code.UNREACHABLE, "no arm")
-    there = replace(found, target=standing_at(found.target, end))
+    there, step = seen_at(found, end), np.array([*(end - found.target.p_base[:2]), 0.0])
     for arm in task.context.arm_order("auto", float(end[1])):
-        refusal = await feasible.refusal(arm, there, now=found)
+        offered = tuple(displaced(one, step) for one in ways[arm])
+        refusal = await feasible.refusal(arm, there, now=found, offered=offered)
         if refusal is None:
             return arm
         fault = refusal
@@ -183,7 +197,7 @@ async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int
     except OpenArmError as error:
         text = f"push {number}: {found.target.label!r} was not seen since: {error.message}"
         raise OpenArmError(error.code, text) from error
-    there = replace(found, target=standing_at(found.target, planned.end))
+    there = seen_at(found, planned.end)
     pushed = task.request.about(there).find(frames, config.detect)
     x, y = p = pushed.target.p_base[:2]
     moved, off = (float(np.hypot(*(p - q))) for q in (planned.start, planned.end))

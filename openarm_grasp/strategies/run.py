@@ -4,27 +4,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.evidence.verdicts import Verdict
-from openarm_grasp.perception.clouds import views_of
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.feasibility import standing_at
+from openarm_grasp.planning.offers import asked, offers
 from openarm_grasp.planning.options import Options
 from openarm_grasp.requests.confirm import ShownPlan
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.requests.states import Hand, State, check_transition
 from openarm_grasp.requests.task import Findings, Grasp, Placed, Status, Task
 from openarm_grasp.robot.interface import Planned
-from openarm_grasp.sampling.samplers import Sampling, make_sampler
-from openarm_grasp.sampling.surface import fuse
-
-_sampler = cache(make_sampler)
+from openarm_grasp.sampling.samplers import Sampling
 
 
 class Run:
@@ -126,39 +122,13 @@ class Run:
             self.arm, self.hand = "", Hand.FREE
 
     def ways(self, arm: str, sighting: Sighting) -> retries.Ways:
-        """Grasps for an arm; those that have failed apart from the others.
-
-        Boxes and cylinders that fit into the hand are grasped across their faces; everything else on its cloud.
-        """
-        sampler, target = _sampler(self.config.sampler), sighting.target
-        spared = bool(target.kind) and self.config.sampler in ("auto", "boxes")  # a surface takes some 50 ms
-        try:
-            offered = sampler.candidates(self.asked(arm, replace(sighting, clouds=()) if spared else sighting))
-        except OpenArmError as error:
-            if error.code is not Code.TOO_WIDE or not (spared and sighting.clouds):
-                raise
-            try:
-                offered = sampler.candidates(self.asked(arm, sighting))
-            except OpenArmError:
-                raise error from None  # a prism that is too wide is just that
-        return retries.among(offered, target, self.failed)
+        """Grasps for an arm; those that have failed apart from the others."""
+        offered = offers(self.context, arm, sighting, self.failed)
+        return retries.among(offered, sighting.target, self.failed)
 
     def asked(self, arm: str, sighting: Sighting) -> Sampling:
-        """Return what a sampler is given; a surface where the points of the object are known."""
-        surface = None
-        if sighting.clouds:
-            views = views_of(sighting.clouds, self.context.table.top_z)
-            surface = fuse(views, self.context.table.top_z, step=self.config.cloud.voxel)
-        return Sampling(
-            sighting.target,
-            self.config,
-            self.context.hand,
-            sighting.others,
-            self.context.shoulders.get(arm, (0.0, 0.0)),
-            surface,
-            None if surface is None else self.context.shape(arm),
-            failed=self.failed,
-        )
+        """Return what a sampler is given."""
+        return asked(self.context, arm, sighting, self.failed)
 
     def start_again(self, grasp: Grasp, placed: Placed | None) -> str:
         """Begin the next attempt at the same object, the failed grasp remembered; returns why.

@@ -54,9 +54,11 @@ def _seen_again(run: Run, grasp: Grasp, seen: Frames) -> Grasp:
     """The grasp of the object as the camera on the hand sees it whose hand is turned most like the chosen one's.
 
     Raises:
-        OpenArmError: When the object is not among the detections, or cannot be trusted.
+        OpenArmError: When the object is not among the detections, cannot be trusted, or is seen in part.
     """
     found = _found(run, grasp, seen)
+    if not found.target.measured:
+        raise OpenArmError(Code.NOTHING_DETECTED, "only a part of it is seen from there")
     before, target = grasp.sighting.target, on_table(found.target, run.context.table.top_z)
     # A box that is observed again may have its edges swapped.
     sighting = replace(grasp.sighting, target=target)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from openarm_common.detection import ANYTHING
 from openarm_perception.detection.detector import Detection2D
 from openarm_perception.detection.localize import Localizer
 from openarm_perception.geometry.depth import Deprojector, View
@@ -13,8 +14,6 @@ from openarm_perception.segmentation.clusters import Cluster, segment
 from openarm_perception.segmentation.divide import SegmentationConfig
 from openarm_perception.segmentation.support import support_at
 
-#: Name of what is found without knowing what it is.
-ANYTHING = "anything"
 #: Nothing on the table is taller than this, m.
 _TALLEST = 0.30
 #: What is found: things that a hand may take whole, flat ones too.

@@ -73,8 +73,8 @@ class PhysicsConfig(Config):
         default=(0.8, 0.005, 0.0001), description="objects, table: sliding, torsional, rolling"
     )
     object_condim: Literal[1, 3, 4, 6] = Field(default=4, description="contact dimensions of objects")
-    finger_kp: float = Field(default=2000.0, gt=0.0, description="N/m")
-    finger_kv: float = Field(default=40.0, ge=0.0, description="N s/m")
+    finger_kp: float = Field(default=4000.0, gt=0.0, description="N/m")
+    finger_kv: float = Field(default=60.0, ge=0.0, description="N s/m")
     finger_force: float = Field(default=30.0, gt=0.0, description="N; each pad presses with half of it")
 
 

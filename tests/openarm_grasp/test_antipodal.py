@@ -99,6 +99,15 @@ def test_what_is_wider_than_the_hand_in_all_directions_has_no_grasp():
     assert search.best() == ()
 
 
+def test_where_nothing_narrower_is_there_the_hand_goes_around_what_leaves_little_room():
+    config, opening = CloudConfig(), hand().opening
+    for room, widest in ((0.012, opening - config.margin), (0.005, opening - 0.5 * config.margin)):
+        width = 2.0 * opening - room
+        search = Search(surface_of([box((width, width, 0.04))]), hand(), config, ApproachConfig())
+        assert search.best()
+        assert search.widest == pytest.approx(2.0 * widest)
+
+
 def test_a_neighbour_keeps_the_fingers_away_from_its_side():
     target = box((0.04, 0.04, 0.06))
     walls = [box((0.02, 0.20, 0.06), x=0.27 + side * 0.045) for side in (1.0, -1.0)]

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.perception.detections import Frame, average, find, in_base, on_table, sticks_out
+from openarm_grasp.planning.feasibility import seen_at
 
 
 def seen(label="red", x=0.26, y=-0.2, z=0.425, yaw=0.0, size=(0.04, 0.06, 0.05), score=0.9) -> Detection:
@@ -203,3 +205,50 @@ def test_how_far_something_reaches_out_of_its_place(yaw) -> None:
     assert sticks_out(seen(size=(0.04, 0.04, 0.05), yaw=0.8), seen(size=(0.04, 0.04, 0.05))) == pytest.approx(
         0.0, abs=1e-12
     )
+
+
+def cloud_of(*detections: Detection) -> LabelledCloud:
+    """Points on top of each detection, labelled by its number."""
+    rng = np.random.default_rng(0)
+    parts = [d.p_base + d.size * (rng.uniform(-0.5, 0.5, (200, 3)) * (1, 1, 0) + (0, 0, 0.5)) for d in detections]
+    labels = np.repeat(np.arange(1, len(parts) + 1, dtype=np.uint32), 200)
+    return LabelledCloud(np.concatenate(parts).astype(np.float32), labels, np.array([0.3, 0.0, 1.2]))
+
+
+def test_a_part_of_something_of_unknown_shape_is_taken_on_its_points() -> None:
+    part = seen("anything", score=0.0)
+    sighting = look([Frame(i, (part,), cloud_of(part)) for i in range(3)], "anything")
+    assert not sighting.target.measured
+    assert len(sighting.clouds) == 3
+    for one in (seen("red", score=0.0), replace(part, code=Code.TABLE_MISMATCH)):
+        with pytest.raises(OpenArmError) as error:
+            look([Frame(i, (one,), cloud_of(one)) for i in range(3)], one.label)
+        assert error.value.code is one.code
+    with pytest.raises(OpenArmError, match="cannot be measured"):
+        look(frames((part,), (part,), (part,)), "anything")
+
+
+def test_what_is_seen_whole_comes_before_what_is_seen_in_part() -> None:
+    part, whole = seen("anything", score=0.0), seen("anything", x=0.4)
+    sighting = look([Frame(i, (part, whole), cloud_of(part, whole)) for i in range(3)], "anything")
+    assert sighting.target.measured
+    assert sighting.target.p_base[0] == pytest.approx(0.4)
+
+
+def test_what_a_frame_cut_off_is_whole_when_most_frames_show_all_of_it() -> None:
+    part, whole = seen("anything", score=0.0), seen("anything")
+    sights = [Frame(i, (d,), cloud_of(d)) for i, d in enumerate((whole, whole, part))]
+    assert look(sights, "anything").target.measured
+    assert not look(sights[1:], "anything").target.measured
+
+
+def test_a_sighting_elsewhere_has_its_points_there_and_those_of_others_where_they_are() -> None:
+    one, other = seen("anything"), seen("anything", y=-0.4)
+    sighting = look([Frame(i, (one, other), cloud_of(one, other)) for i in range(3)], "anything", at=(0.26, -0.2))
+    there = seen_at(sighting, (0.40, 0.1), np.pi / 2.0)
+    assert there.target.p_base[:2] == pytest.approx((0.40, 0.1))
+    for before, after in zip(sighting.clouds, there.clouds, strict=True):
+        mine = before.labels == 1
+        off = (before.points[mine] - one.p_base)[:, [1, 0]] * (-1, 1)
+        assert after.points[mine][:, :2] == pytest.approx(off + np.array([0.40, 0.1]), abs=1e-6)
+        assert (after.points[~mine] == before.points[~mine]).all()

@@ -183,6 +183,25 @@ def test_an_arm_that_missed_leaves_the_next_attempt_to_the_other_where_both_reac
     assert [one.arm for one in lost] == ["right"] * 3
 
 
+def test_what_turned_in_the_hand_is_held_nearer_to_its_weight_next():
+    target = standing("red", 0.26, -0.2)
+    T = [se3.make(se3.rot_x(np.pi), (x, -0.2, 0.43)) for x in (0.38, 0.30, 0.26)]
+    levers = (-1.4, -0.9, -0.1)
+    offered = [
+        replace(
+            propose(target, CONFIG, HAND)[0],
+            id=f"red/{k}/tilt0",
+            T_base_tcp=pose,
+            score=1.0 - 0.4 * k,
+            parts={"lever": lever},
+        )
+        for k, (pose, lever) in enumerate(zip(T, levers, strict=True))
+    ]
+    lost, missed = (FailedGrasp.of(c, "right", offered[0], target) for c in (Code.GRASP_LOST, Code.GRASP_MISSED))
+    assert among(offered, target, (missed,)).fresh[0].id == "red/1/tilt0"
+    assert among(offered, target, (lost,)).fresh[0].id == "red/2/tilt0"
+
+
 def test_of_sampled_grasps_the_one_that_failed_comes_last_and_other_sides_first():
     target = standing("red", 0.26, -0.2)
     offered = propose(target, CONFIG, HAND)

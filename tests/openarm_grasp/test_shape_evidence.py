@@ -12,7 +12,7 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.evidence.shapes import Cluster, ClusterFrame, judge_gone, judge_held, judge_rests
+from openarm_grasp.evidence.shapes import Cluster, ClusterFrame, judge_gone, judge_held, judge_moved, judge_rests
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import Box, GraspCandidate
@@ -155,3 +155,26 @@ def test_a_long_thing_that_turns_about_the_fingers_is_lost(turn, code):
     held = (Box("target/long", se3.make(p=(0.1, 0.0, 0.0)), np.array([0.2, 0.03, 0.02])),)
     assert judge_held(held, points, HELD).code is code
     assert judge_held(held, points[:0], HELD).ok  # what the hand hides proves nothing
+
+
+def slab(x, y, half=(0.05, 0.02), top=0.44, n=1500):
+    rng = np.random.default_rng(int(1e3 * (x + 2 * y)) % 97)
+    return np.column_stack([x + half[0] * rng.uniform(-1, 1, n), y + half[1] * rng.uniform(-1, 1, n), np.full(n, top)])
+
+
+def test_a_neighbour_of_its_height_next_to_its_place_is_not_the_thing_that_has_gone():
+    before = Cluster.of(slab(0.27, -0.20))
+    neighbour = Cluster.of(slab(0.28, -0.172, half=(0.06, 0.005), n=3000))
+    assert judge_gone(before, [frame(neighbour)], HELD, match_radius=0.03).ok
+    still = Cluster.of(slab(0.271, -0.201))
+    assert judge_gone(before, [frame(still)], HELD, match_radius=0.03).code is Code.GRASP_MISSED
+
+
+@pytest.mark.parametrize(("off", "code"), [(0.0, Code.OK), (0.004, Code.OK), (0.03, Code.PLACE_FAILED)])
+def test_what_was_seen_in_part_must_be_seen_where_the_hand_has_moved_it(off, code):
+    part = slab(0.27, -0.2)
+    part = part[part[:, 0] < 0.27]  # the other half was hidden
+    T = se3.make(se3.rot_z(0.7), (0.1, 0.3, 0.0))
+    now = slab(0.27 + off, -0.2) @ T[:3, :3].T + T[:3, 3]
+    assert judge_moved(part, T, now, HELD).code is code
+    assert judge_moved(part, T, np.empty((0, 3)), HELD).code is Code.PLACE_FAILED
