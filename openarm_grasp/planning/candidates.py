@@ -10,10 +10,10 @@ opening axis is always horizontal, so both fingers close at one height and the o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import cos, hypot, radians, sin
+from math import acos, cos, degrees, hypot, radians, sin
 
 import numpy as np
 
@@ -34,6 +34,9 @@ _ROOM_WEIGHT = 0.15
 _ROOM = 0.04
 #: Share of the straight lines that is left of shorter ones.
 _SHORT = 0.625
+#: A little turn of a hand, rad.
+_LITTLE = radians(5.0)
+_TURNS: Mapping[str, Callable[[float], Array]] = {"x": se3.rot_x, "y": se3.rot_y, "z": se3.rot_z}
 #: Half of a finger's thickness, m.
 _FINGER = 0.010
 
@@ -234,13 +237,52 @@ def propose(
     return tuple(sorted(found, key=lambda c: -c.score))
 
 
-def shorter(candidate: GraspCandidate) -> GraspCandidate:
-    """The same grasp on shorter straight lines: near the end of an arm's reach longer ones leave it."""
+def shorter(candidate: GraspCandidate, share: float = _SHORT) -> GraspCandidate:
+    """The same grasp on shorter straight lines: near the end of an arm's reach longer ones leave it.
+
+    Args:
+        candidate: A grasp.
+        share: Of the way to the grasp; the lift is shortened to five eighths at most.
+    """
     return replace(
         candidate,
-        id=f"{candidate.id}/short",
-        approach_offset=_SHORT * candidate.approach_offset,
+        id=f"{candidate.id}/short" + ("" if share == _SHORT else f"{100.0 * share:g}"),
+        approach_offset=share * candidate.approach_offset,
         retreat_offset=_SHORT * candidate.retreat_offset,
+    )
+
+
+def little_turns(candidates: Sequence[GraspCandidate], hand: HandParts) -> tuple[GraspCandidate, ...]:
+    """Each grasp with the hand turned a little about each of its axes."""
+    ways = product("xyz", (_LITTLE, -_LITTLE))
+    return tuple(turned(one, axis, angle, hand) for axis, angle in ways for one in candidates)
+
+
+def turned(candidate: GraspCandidate, axis: str, angle: float, hand: HandParts) -> GraspCandidate:
+    """The same grasp with the hand turned a little, the fingers where they are.
+
+    A wrist that is a little short of its limit in one way has room in another; what is held gives way to the pads.
+
+    Args:
+        candidate: A grasp.
+        axis: Of the hand: x, y (the closing axis) or z (the approach).
+        angle: rad.
+        hand: Measures of the gripper: the tips stay as high above the table.
+    """
+    T = candidate.T_base_tcp @ se3.make(_TURNS[axis](angle))
+    tilt = acos(min(1.0, max(-1.0, -float(T[2, 2]))))
+    T[2, 3] += max(0.0, tips_height(tilt, hand) - tips_height(candidate.tilt, hand))
+    T[2, 3] += hand.opening * abs(float(T[2, 1]) - float(candidate.T_base_tcp[2, 1]))  # of the lower finger
+    back = float(np.linalg.norm(candidate.approach_offset))
+    cost = -_TILT_COST_PER_RAD * abs(angle)
+    return replace(
+        candidate,
+        id=f"{candidate.id}/{axis}{degrees(angle):+g}",
+        T_base_tcp=T,
+        approach_offset=-back * T[:3, 2],
+        tilt=tilt,
+        score=candidate.score + cost,
+        parts={**candidate.parts, "turned": cost},
     )
 
 

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.hand import HandParts
 from openarm_common.wanted import describe
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Frame, Sighting, UntrustedError, in_view, on_table
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.arms import out_of_reach
-from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, shorter
+from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, little_turns, shorter
 from openarm_grasp.planning.options import NoWayError, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets
 from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
@@ -27,6 +28,8 @@ from openarm_grasp.robot.skills import reraise_stop
 if TYPE_CHECKING:
     from openarm_grasp.strategies.run import Run
 
+#: Share of the straight way to a grasp that is tried where none reaches.
+_SHORTEST = 0.35
 #: An object that is observed so may be trusted in the next frames.
 _NOT_TRUSTED = (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT, Code.STALE_DATA)
 
@@ -173,13 +176,13 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
         if short:
             refused = run.findings.refusals.get(run.arm)
             far = refused is not None and refused.code is Code.UNREACHABLE and not run.findings.place_refused
-            offered = tuple(shorter(one) for one in offered) if far else ()
+            offered = _farther(offered, run.context.hand) if far else ()
         if not offered:
             continue
         run.options |= options_of(run.arm, offered, target, run.config.approach)
         text = f"{why}; trying the {run.arm} arm" if why else f"{target.label!r} stands at {where}"
         text += f"; {len(offered)} ways to grasp it" + ("; all that is left has failed before" if repeats else "")
-        text += " on shorter lines" if short else ""
+        text += " on shorter lines, and turned a little" if short else ""
         try:
             return await _plan_with(run, sighting, offered, text)
         except NoGraspError as error:
@@ -198,6 +201,13 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
             distances = {}
         why = f"{out_of_reach(f'{target.label!r} at {where}', distances)} ({why})"
     raise NoGraspError(codes.pop() if len(codes) == 1 else Code.NO_PLAN, why)
+
+
+def _farther(offered: Sequence[GraspCandidate], hand: HandParts) -> tuple[GraspCandidate, ...]:
+    """The same grasps as arms come farther: on shorter lines, and with the hand turned a little each way."""
+    short = [shorter(one) for one in offered]
+    every = [*short, *little_turns(short, hand), *(shorter(one, _SHORTEST) for one in offered)]
+    return tuple(sorted(every, key=lambda one: -one.score))
 
 
 async def _plan_with(

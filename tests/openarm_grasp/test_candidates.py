@@ -22,6 +22,7 @@ from openarm_grasp.planning.candidates import (
     propose,
     target_box,
     tcp_height,
+    turned,
 )
 
 TABLE = 0.40
@@ -250,3 +251,21 @@ def test_what_is_no_box_is_held_as_the_boxes_about_its_cloud():
     assert [one.id for one in held] == ["target/red_0", "target/red_1"]
     for one, part in zip(held, parts, strict=True):
         assert c.T_base_tcp @ one.T_frame_box == pytest.approx(part.T_frame_box)
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_a_hand_that_is_turned_a_little_holds_at_the_same_place_and_stays_above_the_table(axis):
+    for one in propose(box(size=(0.05, 0.09, 0.03)), CONFIG, HAND):
+        for angle in (0.09, -0.09):
+            other = turned(one, axis, angle, HAND)
+            assert se3.angle_between(other.T_base_tcp[:3, :3], one.T_base_tcp[:3, :3]) == pytest.approx(0.09)
+            raised = other.T_base_tcp[:3, 3] - one.T_base_tcp[:3, 3]
+            assert raised[:2] == pytest.approx((0.0, 0.0))
+            assert 0.0 <= raised[2] < 0.008
+            lower = HAND.opening * abs(other.T_base_tcp[2, 1])  # of the two fingers
+            assert other.T_base_tcp[2, 3] - lower >= one.T_base_tcp[2, 3] - 1e-9 - HAND.opening * abs(
+                one.T_base_tcp[2, 1]
+            )
+            assert other.approach_offset == pytest.approx(-CONFIG.approach.pregrasp_distance * other.T_base_tcp[:3, 2])
+            assert -other.T_base_tcp[2, 2] == pytest.approx(np.cos(other.tilt))
+            assert other.score < one.score
