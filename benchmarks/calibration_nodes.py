@@ -2,14 +2,14 @@
 """Hand-eye calibration through the nodes, for true mounts of many seeds, judged by where the mounts really are.
 
     python -m benchmarks.calibration_nodes [--quick] [--seeds 0-19] [--poses 15] [--cameras overhead,wrist]
-                                           [--profile openarm|ideal] [--out FOLDER] [--json PATH]
+                                           [--profile ideal|openarm] [--out FOLDER] [--json PATH]
 
 For each seed a graph `calibrate` is started, and the action /calibration/auto moves the arm, takes the samples and
 solves, for one camera after the other. The same samples are solved again with the first ten. With `--out`, results
 lie in a folder by seed, and seeds that are there are not run again. Only this judge knows the true mounts.
 
-With the motors of the profile `openarm` joint zeros are off and gravity bends the arm; the mount that fits such an arm
-best is not the true one. `ideal` has none of it: there the solver is at its bound.
+The robot is exact. With `--profile openarm` its joint zeros are off and its motors give way to gravity, as those of owners
+do: the mount that fits such an arm best is not the true one, and no grasp by that arm misses it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="0-19", help="of the mounts, such as 0-19")
     parser.add_argument("--poses", type=int, default=15, help="samples a camera")
     parser.add_argument("--cameras", default="overhead,wrist", help="names, joined by commas")
-    parser.add_argument("--profile", choices=("openarm", "ideal"), default="openarm", help="motors of the arms")
+    parser.add_argument("--profile", choices=("ideal", "openarm"), default="ideal", help="motors of the arms")
     parser.add_argument("--out", type=Path, help="folder of results by seed; what is there is not run again")
     parser.add_argument("--json", type=Path, help="where to write the metrics")
     arguments = parser.parse_args()
