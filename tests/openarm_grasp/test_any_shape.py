@@ -13,11 +13,13 @@ from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.clouds import views_of
+from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.strategies.registry import carry_out
 
 
-def alone(name: str, x: float, y: float, yaw: float) -> Scene:
-    """A scene with one object of models/objects on its most frequent side."""
-    item = {"name": name, "shape": "mesh", "object": name, "side": 0, "position": [x, y], "yaw": yaw}
+def alone(name: str, x: float, y: float, yaw: float, side: int = 0) -> Scene:
+    """A scene with one object of models/objects on one of its sides, the most frequent first."""
+    item = {"name": name, "shape": "mesh", "object": name, "side": side, "position": [x, y], "yaw": yaw}
     table = load_scene("empty").table.model_dump()
     return parse_scene({"name": "alone", "table": table, "objects": [item]}, "alone")
 
@@ -43,3 +45,24 @@ def test_images_of_one_camera_are_one_view_and_the_border_of_the_object_is_no_ob
     assert (len(first.target), len(first.others), len(first.table)) == (2, 2, 2)
     assert (len(second.target), len(second.others), len(second.table)) == (1, 1, 1)
     assert np.allclose(first.others[:, 0], 0.35)
+
+
+def test_what_the_border_cuts_is_placed_when_all_of_it_is_seen_there() -> None:
+    senses = SimulatedSenses(depth_noise=True, detector="anything")
+    scene = alone("cereal_box", 0.22, 0.42, 0.3, side=3)
+    trials = Trials(Task("nominal", 1, scene, ("anything",)), senses, GraspConfig())
+    (grasp,) = trials.run()["grasps"]
+    assert grasp["outcome"] == "placed", grasp["message"]
+    assert "what was seen of it is within" in grasp["message"]
+
+
+def test_what_a_hand_keeps_is_judged_by_its_points_where_it_is_placed_later() -> None:
+    senses = SimulatedSenses(depth_noise=True, detector="anything")
+    task = Task("nominal", 1, alone("banana", 0.27, -0.22, 0.4), ("anything",))
+    trials = Trials(task, senses, GraspConfig())
+    trials.robot.pass_time(0.5)
+    for phase in ("pick", "place"):
+        request = GraspRequest("anything" if phase == "pick" else "", phase=phase)
+        outcome = trials.link.run(carry_out(trials.grasp_task(request)))
+        assert outcome.success, outcome.message
+    assert "the cluster is" in outcome.message
