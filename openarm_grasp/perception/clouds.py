@@ -21,6 +21,8 @@ _TABLE = 0.006
 _SAME_CAMERA = 0.002
 #: A place is in view where a point lies this near to it, seen from above, m.
 _IN_VIEW = 0.025
+#: What is seen this near to what stood there is that, and what is seen this near to its middle may be, m.
+_STOOD, _STANDS = 0.015, 0.025
 #: Fewer points are no cluster.
 _LEAST_POINTS = 30
 #: What belongs to no detection and is this near to the object is its border, m.
@@ -89,14 +91,17 @@ def cluster_frames(frames: Sequence[Frame], place: Array) -> tuple[ClusterFrame,
     return tuple(_clusters(frame, frame.cloud, place) for frame in frames if frame.cloud is not None)
 
 
-def risen_points(frames: Sequence[Frame], before: Cluster, rise: float) -> Array:
+def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Array:
     """Return the points (n, 3) of what the newest image shows over the place of a thing, higher than it stood.
+
+    What stood around it, and may be higher, too, is left out.
 
     Args:
         frames: In the base frame.
-        before: The thing as it stood.
+        sighting: The thing as it stood.
         rise: Its upper end is at least this much higher, m.
     """
+    before = cluster_of(sighting)
     frame = next((frame for frame in reversed(frames) if frame.cloud is not None), None)
     found = [np.empty((0, 3))]
     if frame is not None and frame.cloud is not None:
@@ -108,7 +113,24 @@ def risen_points(frames: Sequence[Frame], before: Cluster, rise: float) -> Array
             away = float(np.linalg.norm(now.centroid[:2] - before.centroid[:2]))
             if now.top - before.top >= rise and away <= 0.5 * (now.extent + before.extent):
                 found.append(points)
-    return np.concatenate(found)
+    points, around = np.concatenate(found), _around(sighting.clouds[-1:])
+    if not len(points) or not len(around):
+        return points
+    off, _ = KDTree(around).query(points)
+    return points[off > _STOOD]
+
+
+def stands(other: Detection, frames: Sequence[Frame]) -> bool:
+    """Whether something still stands about where something stood; taken for so, where no cloud says it."""
+    clouds = [frame.cloud for frame in frames if frame.cloud is not None]
+    points = [cloud.points[cloud.labels > 0] for cloud in clouds]
+    near = (np.linalg.norm(each[:, :2] - other.p_base[:2], axis=1) < _STANDS for each in points)
+    return not clouds or any(bool(one.any()) for one in near)
+
+
+def _around(clouds: Sequence[LabelledCloud]) -> Array:
+    """Points (n, 3) of what stands around an object in clouds whose points labelled 1 are its."""
+    return np.concatenate([np.empty((0, 3)), *(cloud.points[cloud.labels > 1].astype(np.float64) for cloud in clouds)])
 
 
 def _clusters(frame: Frame, cloud: LabelledCloud, place: Array) -> ClusterFrame:

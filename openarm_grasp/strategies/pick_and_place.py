@@ -16,15 +16,22 @@ from dataclasses import replace
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.detection import Detection
+from openarm_common.detection import gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.shapes import judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
-from openarm_grasp.perception.clouds import cluster_frames, cluster_of, nearest_to, object_points, risen_points
-from openarm_grasp.perception.detections import SAME_PLACE, Frame, apart
+from openarm_grasp.perception.clouds import (
+    cluster_frames,
+    cluster_of,
+    nearest_to,
+    object_points,
+    risen_points,
+    stands,
+)
+from openarm_grasp.perception.detections import Frame, apart
 from openarm_grasp.planning.candidates import PlaceTarget, held_boxes
 from openarm_grasp.planning.place import place_targets, placing_error
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
@@ -37,6 +44,8 @@ from openarm_grasp.strategies.retreat import retreat, still_held
 from openarm_grasp.strategies.run import Run
 from openarm_grasp.strategies.second_look import second_look
 
+#: Things nearer to each other than this may be parts of one, m.
+_NEXT_TO = 0.03
 #: Frames that must not show the object in its old place after the lift: a detector may miss it in one.
 _LIFT_FRAMES = 2
 
@@ -282,7 +291,7 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
             held = [
                 replace(b, T_frame_box=T @ b.T_frame_box) for b in held_boxes(sighting.target, grasp.candidate, config)
             ]
-            where = judge_held(held, risen_points(frames, before, config.held.rise), config.held)
+            where = judge_held(held, risen_points(frames, sighting, config.held.rise), config.held)
             camera = camera if where.ok else where
     else:
         camera = verdicts.judge_sight(
@@ -393,7 +402,8 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
         if before.cut:
             return _verify_part(run, grasp, placed, frames, T_base_now)
         seen = judge_rests(before, rests, cluster_frames(frames, rests), config.place.tolerance)
-        torn = next((d for d in grasp.sighting.others if d.measured and _gone(d, frames)), None)
+        beside = (d for d in grasp.sighting.others if d.measured and gap(d, grasp.sighting.target) < _NEXT_TO)
+        torn = next((d for d in beside if not stands(d, frames)), None)
         if seen.ok and torn is not None:
             x, y = torn.p_base[:2]
             text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
@@ -431,9 +441,3 @@ def _verify_part(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]
         text = f"its middle, which was not in view before, is {off * 1e3:.0f} mm from its target"
         return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {limit * 1e3:.0f} mm")
     return seen
-
-
-def _gone(other: Detection, frames: Sequence[Frame]) -> bool:
-    """Whether no frame shows anything where something stood next to an object."""
-    seen = [d for frame in frames for d in frame.detections]
-    return all(apart(d, other) > SAME_PLACE for d in seen) and bool(frames)

@@ -2,8 +2,8 @@
 """Which clusters are parts of one thing: the neck of a bottle, the handle of a mug, both handles of scissors.
 
 Convexity cuts things at their notches. Whether two pieces that touch are one thing or two is not in a depth image; what
-is known of things in front of a hand is that they have a size. What was joined wrongly shows when it is lifted: a part
-of it stays.
+is known of things in front of a hand is that they have a size, and few parts: more pieces than that are a heap, and
+stay pieces. What was joined wrongly shows when it is lifted: a part of it stays.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from openarm_common.types import Array, Ints
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
 _TOUCH, _POINTS, _BOXES = 0.008, 4, 0.004
 #: Or where the one lies over the other: so much of it is within the other's outline, seen from above.
 _OVER, _ASKED = 0.3, 200
+#: A thing has no more parts than this.
+_PARTS = 3
 #: What is joined is no larger than this, m: things that a hand grasps are long or wide, not both.
 _LONG, _WIDE = 0.38, 0.20
 
@@ -42,12 +47,23 @@ def joined(clusters: Sequence[Cluster]) -> Ints:
         for j, b in enumerate(clusters[:i])
         if (gap := _gap(clouds[i], clouds[j])) <= (_TOUCH if "unknown" in (a.shape.kind, b.shape.kind) else _BOXES)
     ]
+    heap = _heaps(len(clusters), [(i, j) for _, i, j in pairs])
     for _, i, j in sorted(pairs):
+        if heap[i]:
+            continue
         one, other = root[i], root[j]
         both = np.flatnonzero((root == one) | (root == other))
         if one != other and _fits(np.concatenate([clouds[k] for k in both])):
             root[both] = min(one, other)
     return root
+
+
+def _heaps(count: int, touching: Sequence[tuple[int, int]]) -> NDArray[np.bool_]:
+    """Return which of the pieces (count,) hang together with more than a thing has parts."""
+    ends = np.array(touching, np.int64).reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    return np.bincount(label, minlength=1)[label] > _PARTS
 
 
 def _gap(a: Array, b: Array) -> float:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from openarm_perception.geometry.depth import Deprojector, DepthLimits
 from openarm_perception.segmentation.clusters import Segmentation, segment
 from openarm_perception.segmentation.divide import SegmentationConfig
 from openarm_perception.segmentation.grouping import group
+from openarm_perception.segmentation.parts import joined
 from openarm_perception.segmentation.support import find_support
 from openarm_perception.segmentation.views import merge_views
 from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
@@ -232,3 +235,14 @@ def test_parts_that_touch_are_one_thing_for_a_hand_and_boxes_apart_are_two(table
     assert len(joined) == 2
     assert at(found[1], 0.25, 0.18).shape.kind == "box"
     assert joined[1] > apart[2]
+
+
+def test_more_pieces_than_a_thing_has_parts_are_a_heap_and_stay_pieces():
+    grid = np.stack(np.meshgrid(np.arange(10), np.arange(10), [0.0]), axis=-1).reshape(-1, 3) * 0.004
+
+    def piece(n):
+        return SimpleNamespace(points=grid + np.array([0.04 * n, 0.0, 0.4]), shape=SimpleNamespace(kind="unknown"))
+
+    assert list(joined([piece(n) for n in range(3)])) == [0, 0, 0]
+    assert list(joined([piece(n) for n in range(4)])) == [0, 1, 2, 3]
+    assert list(joined([*(piece(n) for n in range(4)), piece(8), piece(9)])) == [0, 1, 2, 3, 4, 4]
