@@ -188,6 +188,21 @@ def test_a_refusal_keeps_its_reason_when_nothing_else_is_in_view(tmp_path, monke
     assert (row["code"], row["message"]) == ("TOO_WIDE", "90 mm, expected at most 80")
 
 
+def test_of_several_that_were_lifted_the_one_at_the_place_is_judged(tmp_path) -> None:
+    """One may have been dropped at an earlier attempt, from higher up."""
+    run = trials(replace(make_task("nominal", 10001), labels=("anything",)), tmp_path)
+    run.robot.pass_time(0.2)
+    rises = (0.20, 0.10)
+    for (name, track), rise in zip(sorted(run.robot.tracks.items()), rises, strict=True):
+        track.append(replace(track[-1], p_world=track[-1].p_world + np.array([0.0, 0.0, rise])))
+        placed = name
+    x, y, z = (float(v) for v in run.robot.tracks[placed][0].p_world)
+    answer = GraspOutcome(Code.PLACE_FAILED, "", "anything", attempts=2, place_position=(x, y, z))
+    assert run._trial("anything", answer, (), 0.0).target == placed
+    nowhere = replace(answer, place_position=(0.0, 0.0, 0.0))
+    assert run._trial("anything", nowhere, (), 0.0).target != placed
+
+
 @pytest.mark.requirement("R-01")
 def test_heavy_soft_late_arms_with_wrong_zeros_are_identified_and_place_an_object(tmp_path) -> None:
     options = CampaignOptions(seeds=(0,), noise=True, profile="openarm", dynamics_seeds=(41,))
