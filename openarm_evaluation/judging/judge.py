@@ -84,7 +84,8 @@ def judge(
 ) -> Verdict:
     """Judge one object's track from before the grasp to after it.
 
-    An object of any shape may rest on another side than before, since the request promises none, but not have fallen.
+    An object of any shape may rest on another side than before, since the request promises none, but not have fallen
+    since it was lifted last. What an attempt dropped that was reported as lost is not what the last one did.
 
     Args:
         track: Samples in the order of time, the first from before anything moved.
@@ -116,7 +117,7 @@ def judge(
             f"is {1e3 * error:.1f} mm from the target, at most {1e3 * rules.place_tolerance:.0f} are allowed"
         )
     if any_shape:
-        if (fell := fall_of(track)) > rules.fall:
+        if (fell := fall_of(last_carry(track, rules))) > rules.fall:
             reasons.append(f"fell: {1e3 * fell:.0f} mm freely, at most {1e3 * rules.fall:.0f} are allowed")
     elif tilt > rules.tilt:
         reasons.append(f"not upright: tilted by {math.degrees(tilt):.0f} degrees")
@@ -142,6 +143,18 @@ def fall_of(track: Sequence[Sample]) -> float:
         if after.linear[2] < 0.0 and faster > _FREELY * _GRAVITY * seconds:
             fastest = max(fastest, -float(after.linear[2]))
     return fastest**2 / (2.0 * _GRAVITY)
+
+
+def last_carry(track: Sequence[Sample], rules: JudgeConfig = RULES) -> Sequence[Sample]:
+    """Return the samples from when an object rested last before it was lifted; all of them, when it was not."""
+    begin, top = 0, -math.inf
+    for k in range(len(track) - 1, -1, -1):
+        sample, z = track[k], float(track[k].p_world[2])
+        if top - z >= rules.lift and at_rest(sample, rules):
+            begin = k
+            break
+        top = max(top, z)
+    return track[begin:]
 
 
 def end_of(track: Sequence[Sample], rules: JudgeConfig = RULES) -> list[Sample]:

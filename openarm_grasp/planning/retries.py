@@ -32,6 +32,10 @@ _RAISED, _RAISED_AFTER_COLLISION = -1.6, 0.1
 _SAME_SIDES = -0.3
 #: What has turned in the hand is held nearer to its weight next: after each loss the lever counts so much more.
 _LOST = 2.0
+#: A hand that met something on its way stays higher next: what it is lower than that costs so much, per m.
+_LOW = 60.0
+#: It met something, or could not get to the grasp for it.
+_MET = (Code.HAND_COLLISION, Code.EXECUTION_FAILED)
 
 
 @dataclass(frozen=True)
@@ -112,7 +116,8 @@ def proposed(
 def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence[FailedGrasp]) -> Ways:
     """Rank grasps that a sampler has found for the next attempt: fingers go to other sides first.
 
-    What has slipped or turned in the hand is held where its weight pulls less.
+    What has slipped or turned in the hand is held where its weight pulls less, and a hand that met something goes less
+    deep.
 
     Args:
         offered: Best first.
@@ -126,6 +131,10 @@ def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence
     for one in offered:
         score = _SAME_SIDES * max(past.sides(one) for past in failed)
         score += _LOST * lost * one.parts.get("lever", 0.0)
+        if one.apertures is not None:  # boxes have raised grasps of their own
+            height = _offset(one, target)[2]
+            wanted = max((past.offset[2] + RAISE for past in failed if past.code in _MET), default=height)
+            score -= _LOW * max(0.0, wanted - height)
         ranked.append(replace(one, score=one.score + score, parts={**one.parts, "retry": score}))
     ranked.sort(key=lambda c: -c.score)
     again = [any(past.repeated_by(one, target) for past in failed) for one in ranked]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -171,6 +172,8 @@ def test_an_object_of_any_shape_may_rest_on_another_side_but_not_fall() -> None:
     assert not found.placed
     assert found.false_success
     assert found.reasons == (f"fell: 49 mm freely, at most {1e3 * RULES.fall:.0f} are allowed",)
+    later = [replace(one, t_ns=one.t_ns + 2_000_000_000) for one in lifted()]
+    assert judge([*falling, *later], (0.3, 0.0), claimed=True, any_shape=True).placed  # of an attempt that failed
     lowered = lifted(sample(0.2, 0.54, 0.2), sample(0.3, 0.52, 0.4), sample(0.4, 0.48, 0.5))
     assert judge(lowered, (0.3, 0.0), claimed=True, any_shape=True).placed
     assert rise_of(lowered) == pytest.approx(0.13)

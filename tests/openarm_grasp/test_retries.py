@@ -211,3 +211,21 @@ def test_of_sampled_grasps_the_one_that_failed_comes_last_and_other_sides_first(
     assert offered[0].id in {c.id for c in left.repeats}
     assert failed.sides(left.fresh[0]) < 0.1
     assert {c.id for c in (*left.fresh, *left.repeats)} == {c.id for c in offered}
+
+
+def test_a_hand_that_met_something_on_a_cloud_goes_less_deep_next():
+    target = standing("red", 0.26, -0.2)
+    first = replace(propose(target, CONFIG, HAND)[0], apertures=(0.02, 0.06))
+    heights = (0.0, 0.004, 0.012)
+    offered = [
+        replace(
+            first,
+            id=f"red/{k}/tilt0",
+            T_base_tcp=se3.make(p=(0.03 * k, 0.0, up)) @ first.T_base_tcp,
+            score=1.0 - 0.1 * k,
+        )
+        for k, up in enumerate(heights)
+    ]
+    for code, best in ((Code.EXECUTION_FAILED, "red/2/tilt0"), (Code.GRASP_MISSED, "red/1/tilt0")):
+        failed = FailedGrasp.of(code, "right", offered[0], target)
+        assert among(offered, target, (failed,)).fresh[0].id == best
