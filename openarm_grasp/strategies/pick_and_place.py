@@ -18,7 +18,6 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.detection import gap
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.shapes import judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
@@ -396,19 +395,7 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
             break
         text = f"{run.label!r} is not in view after the place; observing again"
     if grasp.of_cloud:
-        before = cluster_of(grasp.sighting)
-        T_base_now = placed.target.T_base_tcp @ se3.inverse(grasp.candidate.T_base_tcp)
-        rests = se3.apply(T_base_now, before.centroid)
-        if before.cut:
-            return _verify_part(run, grasp, placed, frames, T_base_now)
-        seen = judge_rests(before, rests, cluster_frames(frames, rests), config.place.tolerance)
-        beside = (d for d in grasp.sighting.others if d.measured and gap(d, grasp.sighting.target) < _NEXT_TO)
-        torn = next((d for d in beside if not stands(d, frames)), None)
-        if seen.ok and torn is not None:
-            x, y = torn.p_base[:2]
-            text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
-            return CameraVerdict(Code.PLACE_FAILED, f"{text} is not known", final=True)
-        return seen
+        return _verify_shape(run, grasp, placed, frames)
     error = placing_error(run.label, placed.target, frames[-1]) if frames else None
     if error is not None:
         run.task.session.drift.add(run.arm, *error)
@@ -418,26 +405,36 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
     return verdicts.judge_place(run.label, p_target, frames, tolerance, yaw, height, footprint)
 
 
-def _verify_part(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame], T_base_now: Array) -> CameraVerdict:
-    """Judge what was seen in part before the grasp, now that all of it can be seen.
+def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]) -> CameraVerdict:
+    """Judge what is no box by its points, and by the middle of what is seen now.
 
-    Where no place was asked for, it is where it is seen to stand.
+    Where it was seen in part and no place was asked for, it is where it is seen to stand.
     """
-    before = object_points(grasp.sighting.clouds[-1:])
-    middle = se3.apply(T_base_now, grasp.sighting.target.p_base)
-    now, points = nearest_to(frames, middle)
-    seen = judge_moved(before, T_base_now, points, run.config.held)
-    if not seen.ok or now is None:
+    config, before, place = run.config, cluster_of(grasp.sighting), placed.target.position
+    T_base_now = placed.target.T_base_tcp @ se3.inverse(grasp.candidate.T_base_tcp)
+    rests = se3.apply(T_base_now, before.centroid)
+    now, points = nearest_to(frames, rests if before.cut else place)
+    if before.cut:
+        seen = judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
+    else:
+        seen = judge_rests(before, rests, cluster_frames(frames, rests), config.place.tolerance)
+    beside = (d for d in grasp.sighting.others if d.measured and gap(d, grasp.sighting.target) < _NEXT_TO)
+    torn = next((d for d in beside if not before.cut and not stands(d, frames)), None)
+    if seen.ok and torn is not None:
+        x, y = torn.p_base[:2]
+        text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
+        return CameraVerdict(Code.PLACE_FAILED, f"{text} is not known", final=True)
+    whole = now is not None and now.measured
+    if not seen.ok or not (before.cut or whole):
         return seen
-    if not now.measured:
+    if now is None or not whole:
         text = "the border of the image or another thing hides a part of it: it is not known where its middle is"
         return CameraVerdict(Code.PLACE_FAILED, text)
-    x, y = (float(v) for v in now.p_base[:2])
-    if run.request.place is None and not run.request.place_choices:
-        run.place_target = replace(placed.target, position=np.array([x, y, placed.target.position[2]]))
+    if before.cut and run.request.place is None and not run.request.place_choices:
+        run.place_target = replace(placed.target, position=np.array([*now.p_base[:2], place[2]]))
         return seen
-    off, limit = float(np.linalg.norm((now.p_base - placed.target.position)[:2])), run.config.place.tolerance
+    off, limit = float(np.linalg.norm((now.p_base - place)[:2])), config.place.tolerance
     if off > limit:
-        text = f"its middle, which was not in view before, is {off * 1e3:.0f} mm from its target"
-        return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {limit * 1e3:.0f} mm")
+        text = f"its middle is seen {off * 1e3:.0f} mm from its target, expected at most {limit * 1e3:.0f} mm"
+        return CameraVerdict(Code.PLACE_FAILED, text)
     return seen
