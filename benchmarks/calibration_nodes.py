@@ -8,8 +8,8 @@ For each seed a graph `calibrate` is started, and the action /calibration/auto m
 solves, for one camera after the other. The same samples are solved again with the first ten. With `--out`, results
 lie in a folder by seed, and seeds that are there are not run again. Only this judge knows the true mounts.
 
-The robot is exact. With `--profile openarm` its joint zeros are off and its motors give way to gravity, as those of owners
-do: the mount that fits such an arm best is not the true one, and no grasp by that arm misses it.
+The robot is exact. With `--profile openarm` its joint zeros are off and its motors give way to gravity, as those of
+owners do: the mount that fits such an arm best is not the true one.
 """
 
 from __future__ import annotations

@@ -36,6 +36,7 @@ class Grasp:
         candidate: How the hand takes hold.
         places: Ways to put the object down.
         closed: Aperture after the hand had closed on what is no box, m; None: it was not, or it is a box.
+        turned: The camera has seen it turned or slipped in the hand, which does not put it where it should be then.
     """
 
     arm: str
@@ -43,6 +44,7 @@ class Grasp:
     candidate: GraspCandidate
     places: tuple[PlaceTarget, ...]
     closed: float | None = None
+    turned: bool = False
 
     @property
     def of_cloud(self) -> bool:

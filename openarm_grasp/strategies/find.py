@@ -51,7 +51,7 @@ async def find_grasp(run: Run, why: str) -> tuple[Grasp, Planned | None, str]:
         sighting = await detect(run, why)
         if run.kept is not None:
             grasp = grasp_of(run, run.kept.arm, sighting, run.kept.candidate)
-            grasp = run.grasp = replace(grasp, closed=run.kept.closed)
+            grasp = run.grasp = replace(grasp, closed=run.kept.closed, turned=run.kept.turned)
             why = f"the {grasp.arm} hand holds {run.label!r}; {len(grasp.places)} ways to place it"
             if run.request.dry_run:
                 _, target = await plan_place(run, grasp, grasp.places, why)

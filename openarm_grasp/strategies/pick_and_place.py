@@ -291,6 +291,7 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
                 replace(b, T_frame_box=T @ b.T_frame_box) for b in held_boxes(sighting.target, grasp.candidate, config)
             ]
             where = judge_held(held, risen_points(frames, sighting, config.held.rise), config.held)
+            run.grasp = replace(grasp, turned=not where.ok)
             camera = camera if where.ok else where
     else:
         camera = verdicts.judge_sight(
@@ -408,8 +409,12 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
 def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]) -> CameraVerdict:
     """Judge what is no box by its points, and by the middle of what is seen now.
 
-    Where it was seen in part and no place was asked for, it is where it is seen to stand.
+    Where it was seen in part and no place was asked for, it is where it is seen to stand. Of what had turned in the
+    hand nothing is said: a part that is out of view may make up for a shift.
     """
+    if grasp.turned:
+        text = "it had turned or slipped in the hand: nothing shows that it is where it should be"
+        return CameraVerdict(Code.PLACE_FAILED, text)
     config, before, place = run.config, cluster_of(grasp.sighting), placed.target.position
     T_base_now = placed.target.T_base_tcp @ se3.inverse(grasp.candidate.T_base_tcp)
     rests = se3.apply(T_base_now, before.centroid)

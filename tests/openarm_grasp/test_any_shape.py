@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -66,3 +68,17 @@ def test_what_a_hand_keeps_is_judged_by_its_points_where_it_is_placed_later() ->
         outcome = trials.link.run(carry_out(trials.grasp_task(request)))
         assert outcome.success, outcome.message
     assert "the cluster is" in outcome.message
+
+
+def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_that() -> None:
+    senses = SimulatedSenses(depth_noise=True, detector="anything")
+    task = Task("nominal", 1, alone("banana", 0.27, -0.22, 0.4), ("anything",))
+    trials = Trials(task, senses, GraspConfig())
+    trials.robot.pass_time(0.5)
+    assert trials.link.run(carry_out(trials.grasp_task(GraspRequest("anything", phase="pick")))).success
+    ((arm, kept),) = trials.session.kept.items()
+    assert not kept.turned
+    trials.session.kept[arm] = replace(kept, turned=True)
+    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    assert (outcome.success, outcome.attempts) == (True, 2), outcome.message  # it is taken up again from there
+    assert any("it had turned or slipped in the hand" in step.reason for step in trials.steps)
