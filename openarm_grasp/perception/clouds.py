@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From labelled clouds to what samplers and verdicts on things of any shape read. Base frame, m."""
+"""From labelled clouds to what verdicts on things of any shape read. Base frame, m."""
 
 from __future__ import annotations
 
@@ -13,38 +13,13 @@ from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_grasp.evidence.shapes import Cluster, ClusterFrame
 from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting
-from openarm_grasp.sampling.surface import View
 
-#: What is lower above the table is table, m.
-_TABLE = 0.006
-#: Images from cameras nearer to each other are of one camera, m.
-_SAME_CAMERA = 0.002
 #: A place is in view where a point lies this near to it, seen from above, m.
 _IN_VIEW = 0.025
 #: What is seen this near to what stood there is that, and what is seen this near to its middle may be, m.
 _STOOD, _STANDS = 0.015, 0.025
 #: Fewer points are no cluster.
 _LEAST_POINTS = 30
-#: What belongs to no detection and is this near to the object is its border, m.
-_FRINGE = 0.010
-
-
-def views_of(clouds: Sequence[LabelledCloud], table_z: float) -> tuple[View, ...]:
-    """Return what each camera has seen of an object and around it, its images put together.
-
-    Args:
-        clouds: As of a `Sighting`; the first is of the camera over the table, which looks at all around the object.
-        table_z: Height of the table top.
-    """
-    cameras: list[list[LabelledCloud]] = []
-    for cloud in clouds:
-        same = (group for group in cameras if np.linalg.norm(group[0].camera - cloud.camera) < _SAME_CAMERA)
-        group = next(same, None)
-        if group is None:
-            cameras.append([cloud])
-        else:
-            group.append(cloud)
-    return tuple(_view(group, table_z, whole=number == 0) for number, group in enumerate(cameras))
 
 
 def cluster_of(sighting: Sighting) -> Cluster:
@@ -141,16 +116,3 @@ def _clusters(frame: Frame, cloud: LabelledCloud, place: Array) -> ClusterFrame:
             found.append(Cluster.of(points, cut=not detection.measured))
     near = np.linalg.norm(cloud.points[:, :2] - np.asarray(place[:2], np.float32), axis=1) < _IN_VIEW
     return ClusterFrame(frame.t_ns, tuple(found), bool(near.any()))
-
-
-def _view(clouds: Sequence[LabelledCloud], table_z: float, *, whole: bool) -> View:
-    points = np.concatenate([cloud.points for cloud in clouds]).astype(np.float64)
-    labels = np.concatenate([cloud.labels for cloud in clouds])
-    target, standing = points[labels == 1], points[:, 2] > table_z + _TABLE
-    others = np.flatnonzero((labels != 1) & standing)
-    fringe = np.zeros(len(others), np.bool_)
-    loose = labels[others] == 0
-    if len(target) and loose.any():
-        away, _ = KDTree(target).query(points[others[loose]])
-        fringe[loose] = away < _FRINGE
-    return View(clouds[-1].camera, target, points[others[~fringe]], points[(labels != 1) & ~standing], whole)

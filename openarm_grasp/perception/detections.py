@@ -337,6 +337,25 @@ def on_table(d: Detection, table_z: float, *, reach: float = 0.03) -> Detection:
     return replace(d, T_base_object=T, size=np.array([d.size[0], d.size[1], height]))
 
 
+def standing_at(target: Detection, xy: Sequence[float] | Array, turn: float = 0.0) -> Detection:
+    """The object as it would be observed elsewhere, turned by `turn` about the vertical unless it is round."""
+    p = np.array([xy[0], xy[1], target.p_base[2]])
+    turn = 0.0 if target.round else turn
+    return replace(target, T_base_object=se3.make(se3.rot_z(turn) @ target.T_base_object[:3, :3], p))
+
+
+def seen_at(found: Sighting, xy: Sequence[float] | Array, turn: float = 0.0) -> Sighting:
+    """The object with its points as it would be observed elsewhere; as `standing_at`."""
+    there = standing_at(found.target, xy, turn)
+    T = there.T_base_object @ se3.inverse(found.target.T_base_object)
+    clouds: list[LabelledCloud] = []
+    for cloud in found.clouds:
+        points, mine = cloud.points.copy(), cloud.labels == 1
+        points[mine] = se3.apply(T, points[mine].astype(np.float64))
+        clouds.append(replace(cloud, points=points))
+    return replace(found, target=there, clouds=tuple(clouds))
+
+
 def _others(
     frames: Sequence[Frame], target: Detection, match_radius: float, shape: KDTree | None
 ) -> tuple[Detection, ...]:

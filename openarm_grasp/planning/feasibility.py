@@ -8,15 +8,11 @@ rad.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from openarm_common import se3
-from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
@@ -126,25 +122,6 @@ class FeasibilityCheck:
                 if error.code not in NO_WAY or not left:
                     raise
                 refused = error
-
-
-def standing_at(target: Detection, xy: Sequence[float] | Array, turn: float = 0.0) -> Detection:
-    """The object as it would be observed elsewhere, turned by `turn` about the vertical unless it is round."""
-    p = np.array([xy[0], xy[1], target.p_base[2]])
-    turn = 0.0 if target.round else turn
-    return replace(target, T_base_object=se3.make(se3.rot_z(turn) @ target.T_base_object[:3, :3], p))
-
-
-def seen_at(found: Sighting, xy: Sequence[float] | Array, turn: float = 0.0) -> Sighting:
-    """The object with its points as it would be observed elsewhere; as `standing_at`."""
-    there = standing_at(found.target, xy, turn)
-    T = there.T_base_object @ se3.inverse(found.target.T_base_object)
-    clouds: list[LabelledCloud] = []
-    for cloud in found.clouds:
-        points, mine = cloud.points.copy(), cloud.labels == 1
-        points[mine] = se3.apply(T, points[mine].astype(np.float64))
-        clouds.append(replace(cloud, points=points))
-    return replace(found, target=there, clouds=tuple(clouds))
 
 
 def _same(a: PlaceTarget, b: PlaceTarget, *, any_turn: bool) -> bool:

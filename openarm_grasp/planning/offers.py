@@ -9,12 +9,12 @@ from functools import cache
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.clouds import views_of
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import GraspCandidate
 from openarm_grasp.planning.retries import FailedGrasp
 from openarm_grasp.sampling.samplers import Sampling, make_sampler
 from openarm_grasp.sampling.surface import fuse
+from openarm_grasp.sampling.views import views_of
 
 _sampler = cache(make_sampler)
 

@@ -182,7 +182,7 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
         run.options |= options_of(run.arm, offered, target, run.config.approach)
         text = f"{why}; trying the {run.arm} arm" if why else f"{target.label!r} stands at {where}"
         text += f"; {len(offered)} ways to grasp it" + ("; all that is left has failed before" if repeats else "")
-        text += " on shorter lines, and turned a little" if short else ""
+        text += " on shorter lines" if short else ""
         try:
             return await _plan_with(run, sighting, offered, text)
         except NoGraspError as error:
@@ -204,9 +204,10 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
 
 
 def _farther(offered: Sequence[GraspCandidate], hand: HandParts) -> tuple[GraspCandidate, ...]:
-    """The same grasps as arms come farther: on shorter lines, and with the hand turned a little each way."""
+    """The same grasps as arms come farther: on shorter lines, those of clouds with the hand turned a little, too."""
     short = [shorter(one) for one in offered]
-    every = [*short, *little_turns(short, hand), *(shorter(one, _SHORTEST) for one in offered)]
+    shapes = [one for one in short if one.apertures is not None]  # what is no box gives way to pads that are not square
+    every = [*short, *little_turns(shapes, hand), *(shorter(one, _SHORTEST) for one in offered if one.apertures)]
     return tuple(sorted(every, key=lambda one: -one.score))
 
 

@@ -26,9 +26,9 @@ from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.detections import Sighting, seen_at
 from openarm_grasp.planning.candidates import UP, GraspCandidate, displaced, tips_height
-from openarm_grasp.planning.feasibility import FeasibilityCheck, seen_at
+from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.planning.offers import offers
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.confirm import PUSH, agree

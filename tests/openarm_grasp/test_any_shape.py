@@ -14,8 +14,8 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.perception.clouds import views_of
 from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.sampling.views import views_of
 from openarm_grasp.strategies.registry import carry_out
 
 
