@@ -85,7 +85,7 @@ def judge(
     """Judge one object's track from before the grasp to after it.
 
     An object of any shape may rest on another side than before, since the request promises none, but not have fallen
-    since it was lifted last. What an attempt dropped that was reported as lost is not what the last one did.
+    since it was lifted last: what an earlier attempt dropped, the last one has taken up.
 
     Args:
         track: Samples in the order of time, the first from before anything moved.

@@ -62,7 +62,8 @@ class FeasibilityCheck:
         """
         try:
             if place is None:
-                await self._robot.plan_grasp(arm, offered or offers(self._context, arm, found), found, now)
+                ways = offers(self._context, arm, found) if offered is None else offered
+                await self._robot.plan_grasp(arm, ways, found, now)
             else:
                 await self.pick_and_place(arm, found, (np.array(place[:2], dtype=np.float64),), yaw=yaw)
         except OpenArmError as error:

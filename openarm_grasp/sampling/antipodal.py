@@ -144,8 +144,8 @@ class Search:
     def best(self) -> tuple[Antipodal, ...]:
         """Find grasps, best first; the same for the same surface.
 
-        Where the hand has no room for any with a voxel to spare, those are searched that have none, and half the
-        margin beside the fingers.
+        Where the hand has no room for any with a voxel to spare, those are searched that have none, and half of the
+        clearance to the fingers.
         """
         found = self._best()
         if not found:

@@ -291,8 +291,8 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
                 replace(b, T_frame_box=T @ b.T_frame_box) for b in held_boxes(sighting.target, grasp.candidate, config)
             ]
             where = judge_held(held, risen_points(frames, sighting, config.held.rise), config.held)
-            run.grasp = replace(grasp, turned=not where.ok)
-            camera = camera if where.ok else where
+            if not where.ok:
+                run.grasp, camera = replace(grasp, turned=True), where
     else:
         camera = verdicts.judge_sight(
             sighting.target,

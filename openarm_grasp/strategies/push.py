@@ -110,9 +110,9 @@ async def plan_push(task: Task, found: Sighting) -> Push:
         OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
     """
     faults: list[str] = []
-    alone = _alone(found)
-    ways = {arm: offers(task.context, arm, alone) for arm in task.context.shoulders}
-    for end in destinations(found.target, found.others, task.context):
+    ends = destinations(found.target, found.others, task.context)
+    ways = _ways_alone(task.context, found) if ends else {}
+    for end in ends:
         x, y = end
         try:
             return await _push_to(task, found, end, await _taker(task, found, end, ways))
@@ -124,17 +124,33 @@ async def plan_push(task: Task, found: Sighting) -> Push:
     raise OpenArmError(Code.UNREACHABLE, f"it cannot be pushed into reach either: {why}")
 
 
-def _alone(found: Sighting) -> Sighting:
-    """The object without its neighbours: grasps of it are the same wherever it stands alone."""
+def _ways_alone(context: GraspContext, found: Sighting) -> Mapping[str, tuple[GraspCandidate, ...]]:
+    """Grasps of the object without its neighbours by arm: they are the same wherever it stands alone.
+
+    Raises:
+        OpenArmError: UNREACHABLE, with the reason, when no hand fits around it even then.
+    """
     clouds = (replace(c, points=c.points[c.labels != 2], labels=c.labels[c.labels != 2]) for c in found.clouds)
-    return replace(found, others=(), clouds=tuple(clouds))
+    alone = replace(found, others=(), clouds=tuple(clouds))
+    ways: dict[str, tuple[GraspCandidate, ...]] = {}
+    fault = ""
+    for arm in context.shoulders:
+        try:
+            ways[arm] = offers(context, arm, alone)
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            fault = error.message
+    if not ways:
+        raise OpenArmError(Code.UNREACHABLE, f"a push would not help either: {fault}")
+    return ways
 
 
 async def _taker(task: Task, found: Sighting, end: Array, ways: Mapping[str, tuple[GraspCandidate, ...]]) -> str:
     """The arm that grasps the object there, by its grasps where the object stands now."""
     feasible, fault = FeasibilityCheck(task.robot, task.context), OpenArmError(Code.UNREACHABLE, "no arm")
     there, step = seen_at(found, end), np.array([*(end - found.target.p_base[:2]), 0.0])
-    for arm in task.context.arm_order("auto", float(end[1])):
+    for arm in (arm for arm in task.context.arm_order("auto", float(end[1])) if arm in ways):
         offered = tuple(displaced(one, step) for one in ways[arm])
         refusal = await feasible.refusal(arm, there, now=found, offered=offered)
         if refusal is None:

@@ -45,8 +45,8 @@ class PhysicsConfig(Config):
     """Solver, contact and finger settings with which grasps hold by friction alone.
 
     `impratio` and a few no-slip iterations keep a held object from creeping. The finger force is `finger_kp` times the
-    remaining travel of a finger, up to `finger_force`, also where a hinge drives it. The motors of the arms are
-    `HardwareConfig`.
+    remaining travel of a finger, up to `finger_force`, also where a hinge drives it: all of it from a gap of 15 mm on,
+    since the motor of a real hand limits its torque whatever the gap. The motors of the arms are `HardwareConfig`.
     """
 
     timestep: float = Field(
