@@ -37,8 +37,10 @@ _RELATIONS: Mapping[Words, tuple[float, float] | None] = {
     ("nearest", "to"): None,
     ("closest", "to"): None,
 }
+#: Chooses what needs the least to be taken.
+EASIEST = "easiest"
 _CHOICES: Mapping[str, Callable[[Detection, Sequence[Detection]], float]] = {
-    "easiest": lambda one, others: _trouble(one, others),
+    EASIEST: lambda one, others: _trouble(one, others),
     "largest": lambda one, _: -float(np.prod(one.size)),
     "biggest": lambda one, _: -float(np.prod(one.size)),
     "smallest": lambda one, _: float(np.prod(one.size)),

@@ -17,13 +17,17 @@ from openarm_common.detection import Detection
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.candidates import Box, obstacle_boxes
+from openarm_grasp.planning.candidates import UP, Box, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
 
 #: Edge of a column of points; points so far out of the box of a thing are its own, m.
 _STEP, _OUT = 0.005, 0.004
 #: A plan keeps so far from obstacles, and what is lifted touches none of them at first, m.
 _APART = 0.004
+#: Boxes about a thing, and the share of its volume that a further one must save.
+_MOST, _SAVED = 20, 0.02
+#: What reaches over an object by no more than this slides off it when it is lifted, m.
+_OVER = 0.015
 #: Fewer points say nothing of a shape.
 _LEAST_POINTS = 30
 
@@ -37,50 +41,87 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
         config: Margins.
     """
     boxes = dict(zip(map(id, found.others), obstacle_boxes(found.others, config), strict=True))
-    points = [cloud.points[cloud.labels > 1].astype(np.float64) for cloud in found.clouds]
-    seen, parts = np.concatenate([np.empty((0, 3)), *points]), list[Box]()
+    parts = list[Box]()
     for one in found.others:
         whole = boxes[id(one)]
-        own = _inside(seen, one) if not (one.kind and one.measured) else seen[:0]
-        made = (whole,) if len(own) < _LEAST_POINTS else slabs(one.label, _columns(own, one.bottom), _STEP)
+        own = points_of(found, one) if not (one.kind and one.measured) else np.empty((0, 3))
+        made = (
+            (whole,)
+            if len(own) < _LEAST_POINTS
+            else slabs(one.label, columns(own, one.bottom), _STEP, most=_MOST, saved=_SAVED)
+        )
         parts += [replace(box, id=f"{whole.id}/{n}" if len(made) > 1 else whole.id) for n, box in enumerate(made)]
     for box in held:
         parts = [cut for part in parts if (cut := _beside(part, box)) is not None]
+    for box in held:
+        parts = [cut for part in parts if (cut := _not_over(part, box, config.approach.lift_height)) is not None]
     return tuple(parts)
 
 
-def _inside(points: Array, one: Detection) -> Array:
-    """Points (n, 3) that are in the box about a thing."""
+def points_of(found: Sighting, one: Detection) -> Array:
+    """Points (n, 3) that belong to a neighbour of an object: those in the box about it; (0, 3) without clouds."""
+    clouds = [cloud.points[cloud.labels > 1].astype(np.float64) for cloud in found.clouds]
+    points = np.concatenate([np.empty((0, 3)), *clouds])
     local = se3.apply(se3.inverse(one.T_base_object), points)
     return points[(np.abs(local) <= 0.5 * one.size + _OUT).all(axis=1)]
 
 
-def _columns(points: Array, floor: float) -> Array:
-    """Middles of voxels (n, 3) from the highest point of each column down to a height."""
+def tops(points: Array) -> Array:
+    """Highest point (n, 3) of each column of points, at its middle."""
     cell, column = np.unique(np.floor(points[:, :2] / _STEP).astype(np.int64), axis=0, return_inverse=True)
-    top = np.full(len(cell), floor)
+    top = np.full(len(cell), -np.inf)
     np.maximum.at(top, column.reshape(-1), points[:, 2])
-    many = np.maximum(np.ceil((top - floor) / _STEP), 1.0).astype(np.int64)
+    return np.column_stack([(cell + 0.5) * _STEP, top])
+
+
+def columns(points: Array, floor: float) -> Array:
+    """Middles of voxels (n, 3) from the highest point of each column down to a height."""
+    high = tops(points)
+    many = np.maximum(np.ceil((high[:, 2] - floor) / _STEP), 1.0).astype(np.int64)
     level = np.arange(int(many.sum())) - np.repeat(np.cumsum(many) - many, many)
-    middles = [(np.repeat(cell, many, axis=0) + 0.5) * _STEP, floor + (level + 0.5) * _STEP]
-    return np.column_stack(middles).astype(np.float64)
+    return np.column_stack([np.repeat(high[:, :2], many, axis=0), floor + (level + 0.5) * _STEP]).astype(np.float64)
 
 
 def _beside(part: Box, held: Box) -> Box | None:
     """A box without what reaches into another one, cut at the side where least is lost; None when nothing is left."""
-    T = se3.inverse(part.T_frame_box) @ held.T_frame_box
-    half, reach = 0.5 * part.size, 0.5 * np.abs(T[:3, :3]) @ held.size + _APART
-    low, high = T[:3, 3] - reach, T[:3, 3] + reach
-    # how much goes when all above `low`, or all below `high`, is cut off
-    above, below = half - low, half + high
+    above, below = _overlap(part, held)
     if (np.concatenate([above, below]) <= 0.0).any():
         return part
     share = np.concatenate([above, below]) / np.tile(part.size, 2)
     best = int(share.argmin())
-    axis, lost = best % 3, float(np.concatenate([above, below])[best])
-    if share[best] >= 1.0 or part.size[axis] - lost < _STEP / 2.0:
+    lost = float(np.concatenate([above, below])[best])
+    if share[best] >= 1.0 or part.size[best % 3] - lost < _STEP / 2.0:
         return None
+    return _cut(part, best % 3, lost, top=best < 3)
+
+
+def _not_over(part: Box, held: Box, lift: float) -> Box | None:
+    """A box without what reaches a little over one that is lifted; as it is where that is more than a little."""
+    up = se3.make(p=(0.0, 0.0, 0.5 * lift))
+    above, below = _overlap(part, replace(held, T_frame_box=held.T_frame_box @ up, size=held.size + lift * UP))
+    if (np.concatenate([above, below]) <= 0.0).any():
+        return part
+    lost = np.concatenate([above[:2], below[:2]])
+    best = int(lost.argmin())
+    if lost[best] > _OVER + _APART:
+        return part
+    axis = best % 2
+    return _cut(part, axis, float(lost[best]), top=best < 2) if part.size[axis] - lost[best] >= _STEP / 2.0 else None
+
+
+def _overlap(part: Box, held: Box) -> tuple[Array, Array]:
+    """What of a box two cuts along each of its axes take, m: above the low end of another box, and below its high end.
+
+    0 or less: they are apart.
+    """
+    T = se3.inverse(part.T_frame_box) @ held.T_frame_box
+    half, reach = 0.5 * part.size, 0.5 * np.abs(T[:3, :3]) @ held.size + _APART
+    return half - (T[:3, 3] - reach), half + (T[:3, 3] + reach)
+
+
+def _cut(part: Box, axis: int, lost: float, *, top: bool) -> Box:
+    """A box without so much of its top, or its bottom, along an axis."""
     size, shift = part.size.copy(), np.zeros(3)
     size[axis] -= lost
-    shift[axis] = -0.5 * lost if best < 3 else 0.5 * lost
+    shift[axis] = -0.5 * lost if top else 0.5 * lost
     return replace(part, T_frame_box=part.T_frame_box @ se3.make(p=shift), size=size)

@@ -7,6 +7,7 @@ what came of it. Bins are rectangles on the table, base frame, m.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +18,12 @@ from pydantic import Field, model_validator
 
 from openarm_common.config import Config, Interval, load_config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.wanted import EASIEST
+from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.request import GraspRequest
 
 #: (x, y), base frame, m.
 Spot = tuple[float, float]
-#: What is asked for first of all that fits: see `openarm_common.wanted`.
-_FIRST = "easiest"
 #: With these there is nothing more to ask for, whatever it is.
 _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 #: There is no more of it in view.
@@ -31,6 +32,8 @@ _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
 #: Requests that moved an arm in vain, or saw nothing, one after the other, until a label is given up.
 _IN_VAIN = 3
+#: What is left so near to where something was left before is that, m.
+_SAME_SPOT = 0.02
 
 
 class Bin(Config):
@@ -108,8 +111,9 @@ class Order:
     """Objects to be picked one after the other: of those that fit, the easiest first.
 
     What cannot be taken is left until all others have been tried, and asked for again when something has been taken
-    away since: it may have been in the way, or have hidden it. The order ends when nothing is left, or nothing can be
-    done about what is.
+    away since: it may have been in the way, or have hidden it. Where no easy one is left, each is asked for by where it
+    is: what stands close to it may be pushed aside then, after which others may have become easy. The order ends when
+    nothing is left, or nothing can be done about what is.
 
     Attributes:
         labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
@@ -130,6 +134,8 @@ class Order:
     _ended: dict[str, int] = field(default_factory=dict[str, int])
     _in_vain: int = 0
     _held: str = ""
+    _pressed: list[Spot] = field(default_factory=list[Spot])
+    _stirred: int = 0
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -149,19 +155,34 @@ class Order:
         if self.over:
             return None
         if self._held:
-            return GraspRequest(f"{_FIRST} {self._held}", phase="place", place_choices=self._spots(self._held))
+            return GraspRequest(f"{EASIEST} {self._held}", phase="place", place_choices=self._spots(self._held))
         for label in dict.fromkeys(self.labels):
             most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
             if label in self.failed or (most and self.placed.count(label) >= most):
                 continue
-            if self._ended.get(label) == len(self.placed):
-                continue  # nothing has been taken away since
+            if self._ended.get(label) == len(self.placed):  # nothing has been taken away since
+                where = self._hard(label)
+                if where is None:
+                    continue
+                return GraspRequest(
+                    label, object_at=where, exclude_near=tuple(self._stand), place_choices=self._spots(label)
+                )
             # whatever it was asked for as, what was placed or left is not asked for again
             left = (one.where for one in self.left if one.where is not None)
             return GraspRequest(
-                f"{_FIRST} {label}", exclude_near=(*self._stand, *left), place_choices=self._spots(label)
+                f"{EASIEST} {label}", exclude_near=(*self._stand, *left), place_choices=self._spots(label)
             )
         return None
+
+    def _hard(self, label: str) -> Spot | None:
+        """Where something was left that no hand has room around, and that was not asked for by its place yet."""
+        if self._stirred >= _IN_VAIN:
+            return None
+        left = (one.where for one in self.left if one.label == label and one.code in NO_WAY)
+        return next((where for where in left if where is not None and not self._was_pressed(where)), None)
+
+    def _was_pressed(self, where: Spot) -> bool:
+        return any(math.dist(where, spot) < _SAME_SPOT for spot in self._pressed)
 
     def _spots(self, label: str) -> tuple[Spot, ...]:
         return () if self.bins is None else self.bins.bins[self.bins.of(label)].slots(self.bins.spacing)
@@ -169,7 +190,7 @@ class Order:
     @staticmethod
     def label_of(request: GraspRequest) -> str:
         """Which of the labels a request is for."""
-        return request.label.removeprefix(f"{_FIRST} ")
+        return request.label.removeprefix(f"{EASIEST} ")
 
     def done(
         self,
@@ -202,7 +223,10 @@ class Order:
             self.left.pop()  # what was left in the hand
         unseen = seen is None and code in _NOT_SEEN
         self._in_vain = self._in_vain + 1 if (touched or unseen) and code is not Code.OK else 0
+        if request.object_at is not None:
+            self._done_hard(label, request.object_at, touched=touched)
         if code is Code.OK:
+            self._pressed, self._stirred = [], 0
             self.placed.append(label)
             if len(placed) >= 2:
                 self._stand.append((float(placed[0]), float(placed[1])))
@@ -216,6 +240,16 @@ class Order:
             if (where is None and not unseen) or self._in_vain >= _IN_VAIN:
                 self._ended[label], self._in_vain = len(self.placed), 0
         return next((one for one in self.left if one not in before), None)
+
+    def _done_hard(self, label: str, where: Sequence[float], *, touched: bool) -> None:
+        """Note that what was left somewhere was asked for by its place; what moved may have freed something."""
+        spot = (float(where[0]), float(where[1]))
+        self._pressed.append(spot)
+        self.left = [one for one in self.left if one.where is None or math.dist(one.where, spot) >= _SAME_SPOT]
+        if touched:
+            self._stirred += 1
+            self._ended.pop(label, None)
+            self.left = [one for one in self.left if one.label != label]
 
     def _none_left(self, label: str, code: Code, message: str) -> None:
         """Nothing more of a label is in view besides what was left: that is tried again if it may have become free."""

@@ -152,6 +152,19 @@ class Skills:
         gone = () if now is None else (target_box(now.target, config),)
         return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone, start))
 
+    async def plan_sweep(
+        self, arm: str, ways: Sequence[GraspCandidate], found: Sighting, heap: tuple[Box, ...]
+    ) -> Planned:
+        """Plan a closed hand through several things that go with it.
+
+        Args:
+            arm: Whose.
+            ways: The candidates.
+            found: What stands around them.
+            heap: Boxes about them.
+        """
+        return await self.plan(PlanGrasp(arm, tuple(ways), neighbours(found, heap, self._config), heap))
+
     async def plan_place(
         self,
         arm: str,

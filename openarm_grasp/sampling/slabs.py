@@ -12,8 +12,6 @@ from openarm_common.types import Array
 from openarm_common.walls import wall_yaw
 from openarm_grasp.planning.candidates import Box
 
-#: A further box must save this share of the volume of the one about everything.
-_SAVED = 0.06
 #: Cuts of a box are tried at so many places along each axis.
 _CUTS = 8
 
@@ -26,7 +24,9 @@ class _Cut(NamedTuple):
     at: float
 
 
-def slabs(label: str, points: Array, step: float, *, gap: float = 0.0, most: int = 8) -> tuple[Box, ...]:
+def slabs(
+    label: str, points: Array, step: float, *, gap: float = 0.0, most: int = 8, saved: float = 0.06
+) -> tuple[Box, ...]:
     """Put upright boxes around points, cut where that saves most volume.
 
     Args:
@@ -35,10 +35,11 @@ def slabs(label: str, points: Array, step: float, *, gap: float = 0.0, most: int
         step: Edge of a voxel.
         gap: The boxes end this far above the lowest voxel, so that what stands on a table is not in collision with it.
         most: Boxes.
+        saved: Share of the volume of the one about everything that a further box must save.
     """
     R = se3.rot_z(wall_yaw(points[:, :2], step))
     parts = [points @ R]
-    least = _SAVED * _volume(parts[0], step)
+    least = saved * _volume(parts[0], step)
     cuts = [_cut(parts[0], step)]
     while len(parts) < most:
         n = int(np.argmax([cut.saved for cut in cuts]))

@@ -169,9 +169,16 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
     run.options, why = {}, ""
     arms = run.context.arm_order(request.arm, float(target.p_base[1]))
     arms = retries.arms_to_try(arms, run.failed)
-    ways = {arm: run.ways(arm, sighting) for arm in arms}
+    ways: dict[str, retries.Ways] = {}
+    for arm in arms:
+        try:
+            ways[arm] = run.ways(arm, sighting)
+        except OpenArmError as error:
+            if error.code is not Code.IN_COLLISION:
+                raise  # it does not fit into a hand wherever it stands
+            run.findings.refusals[arm] = Verdict(error.code, error.message)
     where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
-    for short, repeats, run.arm in product((False, True), (False, True), arms):
+    for short, repeats, run.arm in product((False, True), (False, True), ways):
         offered = ways[run.arm].repeats if repeats else ways[run.arm].fresh
         if short:
             refused = run.findings.refusals.get(run.arm)

@@ -5,32 +5,28 @@ A closed hand goes behind it, low, and along a straight line; an observation fol
 
 A hand comes to more places than it can grasp at: a grasp also needs room above, and one of a few yaws. Where an object
 can be pushed is not written down but planned: the way behind the object, straight down, and the line itself, with the
-object as what the hand carries, so that both keep clear of everything else. Base frame, m, rad.
+object as what the hand carries, so that both keep clear of everything else. What stands in a crowd has no such place:
+there the hand pushes it together with what it meets, and what comes of it is observed. Base frame, m, rad.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
-from itertools import product
-from math import cos, hypot, inf, pi, radians, sin
 
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
-from openarm_grasp.config import GraspConfig
+from openarm_common.wanted import EASIEST
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting, seen_at
-from openarm_grasp.planning.candidates import UP, GraspCandidate, displaced, tips_height
+from openarm_grasp.planning.candidates import GraspCandidate, displaced
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.planning.offers import offers
 from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.pushes import closed_hand, crowded, destinations, direction, push_ways, sweeps
 from openarm_grasp.requests.confirm import PUSH, agree
 from openarm_grasp.requests.request import Feasible, GraspOutcome
 from openarm_grasp.requests.task import Task
@@ -38,10 +34,10 @@ from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 
-#: Between two points of a hand's shape, m.
-_GRAIN = 0.005
-#: Points no further behind the foremost than this are at the front, m.
-_FLAT = 0.002
+#: Lines through a crowd that are planned at most, by arm.
+_SWEEPS = 10
+#: Turns of a hand that meets things of any shape, deg.
+_TURNS = (0.0, 30.0, -30.0)
 
 
 @dataclass(frozen=True)
@@ -54,6 +50,7 @@ class Push:
         end: (2,) where it should stand afterwards.
         way: How the hand stands behind it, and its line.
         plan: The trajectories.
+        why: What it is good for.
     """
 
     arm: str
@@ -61,24 +58,25 @@ class Push:
     end: Array
     way: GraspCandidate
     plan: Planned
+    why: str
 
     def __str__(self) -> str:
         """Sentence for the status."""
         (x0, y0), (x1, y1) = self.start, self.end
-        return f"the {self.arm} hand pushes it from ({x0:.3f}, {y0:.3f}) to ({x1:.3f}, {y1:.3f}) m, into reach"
+        return f"the {self.arm} hand pushes it from ({x0:.3f}, {y0:.3f}) to ({x1:.3f}, {y1:.3f}) m, {self.why}"
 
 
 async def push(task: Task) -> GraspOutcome | None:
     """Push an object that no arm can grasp where it is into reach, observe, and pick it; several times if need be."""
     refused = task.outcome
-    if refused is None or task.findings.place_refused:
-        return None
+    if refused is None or task.findings.place_refused or EASIEST in task.request.label.casefold().split():
+        return None  # the easiest object is that for which nothing need be pushed
     for number in range(1, task.context.config.push.most + 1):
         found = task.findings.need_sighting()
-        if not found.target.measured:
+        if not (found.target.measured or _may_sweep(task, found)):
             return None  # how far it reaches is not known
         try:
-            planned = await plan_push(task, found)
+            planned = await _plan(task, found)
         except OpenArmError as error:
             if number == 1 or error.code not in NO_WAY:
                 raise
@@ -101,6 +99,31 @@ async def push(task: Task) -> GraspOutcome | None:
         if not task.may_go_on(refused) or task.findings.place_refused:
             break
     return refused
+
+
+def _may_sweep(task: Task, found: Sighting) -> bool:
+    """Whether what stands around the object may be moved with it; what comes of that is not known beforehand."""
+    return crowded(found) and not task.request.dry_run
+
+
+async def _plan(task: Task, found: Sighting) -> Push:
+    """A push into reach; in a crowd, where there is none, one through it.
+
+    Raises:
+        OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
+    """
+    fault = ""
+    if found.target.measured:
+        try:
+            return await plan_push(task, found)
+        except OpenArmError as error:
+            if error.code not in NO_WAY or not _may_sweep(task, found):
+                raise
+            fault = f"{error.message}; "
+    try:
+        return await plan_sweep(task, found)
+    except OpenArmError as error:
+        raise OpenArmError(error.code, f"{fault}{error.message}") from error
 
 
 async def plan_push(task: Task, found: Sighting) -> Push:
@@ -174,8 +197,34 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
                 raise
             faults.append(error.message)
             continue
-        return Push(arm, found.target.p_base[:2], end, ways[plan.chosen], plan)
+        return Push(arm, found.target.p_base[:2], end, ways[plan.chosen], plan, "into reach")
     raise OpenArmError(Code.UNREACHABLE, f"no hand comes behind it: {'; '.join(faults)}")
+
+
+async def plan_sweep(task: Task, found: Sighting) -> Push:
+    """Find a line through the crowd that an object stands in.
+
+    Raises:
+        OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
+    """
+    context, robot, faults = task.context, task.robot, list[str]()
+    for arm in context.arm_order("auto", float(found.target.p_base[1])):
+        hand = closed_hand(robot.description, arm)
+        for sweep in sweeps(found, hand, context)[:_SWEEPS]:
+            ways = push_ways(sweep.met, sweep.end, context.config, hand, context.hand, _TURNS)
+            if not ways:
+                faults.append(f"{arm} hand: what stands there is too thin for it")
+                continue
+            try:
+                plan = await robot.plan_sweep(arm, ways, replace(found, others=sweep.rest), sweep.heap)
+            except OpenArmError as error:
+                if error.code not in NO_WAY:
+                    raise
+                faults.append(error.message)
+                continue
+            return Push(arm, found.target.p_base[:2], sweep.freed, ways[plan.chosen], plan, "through what is near it")
+    why = f"{faults[0]} ({len(faults) - 1} other lines refused)" if faults else "there is no room around it"
+    raise OpenArmError(Code.UNREACHABLE, f"nor can it be pushed out of what is near it: {why}")
 
 
 async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int) -> tuple[Sighting, str]:
@@ -193,12 +242,16 @@ async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int
     """
     config, robot, arm, way = task.context.config, task.robot, planned.arm, planned.way
     task.note(f"push {number} of at most {config.push.most}: {planned}")
-    T_base_back, fault = way.T_base_tcp, None
+    T_base_back, fault, short = way.T_base_tcp, None, ""
     try:
         await _go_behind(task, planned)
-        p_back = way.retreat_offset - config.push.gap * _direction(way.retreat_offset)
-        T_base_back = se3.make(p=p_back) @ way.T_base_tcp
-        await robot.follow(arm, planned.plan.retreat, "push")
+        try:
+            await robot.follow(arm, planned.plan.retreat, "push")
+        except OpenArmError as error:
+            if error.code is not Code.EXECUTION_FAILED:
+                raise
+            short = f"; {error.message}"  # what was pushed has moved all the same: that is observed
+        T_base_back = se3.make(p=-config.push.gap * direction(way.retreat_offset)) @ robot.T_base_tcp(arm)
     except OpenArmError as error:
         fault = error
     if fault is None or fault.code not in STOPS:
@@ -219,7 +272,7 @@ async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int
     moved, off = (float(np.hypot(*(p - q))) for q in (planned.start, planned.end))
     text = (
         f"push {number} by the {arm} hand moved it {moved * 1e3:.0f} mm to ({x:.3f}, {y:.3f}) m, {off * 1e3:.0f} mm"
-        " from its destination"
+        f" from its destination{short}"
     )
     task.note(text)
     return pushed, text
@@ -245,120 +298,3 @@ async def _go_home(task: Task, arm: str, T_base_back: Array) -> None:
         reraise_stop(error)
         task.robot.warn(error.message)  # the free path home may still be there
     await task.robot.go_home((arm,), back_off_below=task.context.clear_of_objects)
-
-
-def destinations(target: Detection, others: Sequence[Detection], context: GraspContext) -> tuple[Array, ...]:
-    """Places around the object, on the table and free of others: short pushes first, then those to the sides.
-
-    Args:
-        target: The object.
-        others: What else stands on the table.
-        context: Parameters and table.
-    """
-    config, place, table = context.config.push, context.config.place, context.table
-    p, half = target.p_base[:2], 0.5 * float(np.hypot(*target.size[:2]))
-    found: list[tuple[float, float, float, float]] = []
-    for length, k in product(config.lengths, range(config.directions)):
-        angle = 2.0 * pi * k / config.directions
-        x, y = float(p[0] + length * cos(angle)), float(p[1] + length * sin(angle))
-        room = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
-        on_table = table.x[0] + half <= x <= table.x[1] - half and table.y[0] + half <= y <= table.y[1] - half
-        if on_table and room >= place.neighbour_distance:
-            found.append((length, -round(abs(sin(angle)), 3), x, y))
-    return tuple(np.array([x, y]) for _, _, x, y in sorted(found))
-
-
-def push_ways(
-    target: Detection, end: Array, config: GraspConfig, hand: Array, measures: HandParts
-) -> tuple[GraspCandidate, ...]:
-    """How a closed hand may stand behind the object, the most upright first.
-
-    One of its four faces points ahead, so that a flat side of the object is met flat; it leans sideways, or with its
-    tips ahead, never over the object. Whatever part of the hand comes first must meet the object at half of its height
-    or lower, else the object would tip over.
-
-    Args:
-        target: The object.
-        end: (2,) where it should be pushed.
-        config: Parameters.
-        hand: Points (n, 3) of the closed hand, TCP frame.
-        measures: Of the hand.
-    """
-    way = np.array([*(end - target.p_base[:2]), 0.0])
-    ahead = _direction(way)
-    aside = np.cross(UP, ahead)
-    half, half_width = (
-        0.5 * float(np.abs(target.T_base_object[:3, :2].T @ v) @ target.size[:2]) for v in (ahead, aside)
-    )
-    tall = float(target.size[2])
-    faces = (("ahead+", ahead), ("ahead-", -ahead), ("aside+", aside), ("aside-", -aside))
-    found: list[GraspCandidate] = []
-    for (name, y_tool), tilt_deg, lean in product(faces, config.push.tilts_deg, (1.0, -1.0)):
-        heading = lean * np.cross(UP, y_tool)
-        if (tilt_deg == 0.0 and lean < 0.0) or float(heading @ ahead) < -1e-6:
-            continue
-        tilt = radians(tilt_deg)
-        R = se3.rotation_from_z_y(sin(tilt) * heading - cos(tilt) * UP, y_tool)
-        height = tips_height(tilt, measures)
-        met = _front(hand @ R.T, ahead, half_width, (-height, tall - height))
-        if met is None or met[1] + height > 0.5 * tall:
-            continue
-        front, _ = met
-        p = target.p_base - (half + front + config.push.gap) * ahead
-        p[2] = target.bottom + height
-        found.append(
-            GraspCandidate(
-                id=f"{target.label}/push/{name}/tilt{tilt_deg:g}" + (f"/lean{lean:+g}" if tilt_deg else ""),
-                T_base_tcp=se3.make(R, p),
-                approach_offset=config.approach.pregrasp_distance * UP,
-                retreat_offset=way + config.push.gap * ahead,
-                width=0.0,
-                tilt=tilt,
-                score=-tilt,
-                parts={"tilt": -tilt},
-            )
-        )
-    return tuple(sorted(found, key=lambda c: -c.score))
-
-
-@cache
-def closed_hand(description: RobotDescription, arm: str) -> Array:
-    """Points (n, 3) of the hand and its closed fingers, some mm apart, TCP frame, m."""
-    tcp = description.tcp_link(arm)
-    palm = description.chain(tcp)[-1].parent
-    links = [palm, *(joint.child for joint in description.joints.values() if joint.parent == palm)]
-    poses = description.link_poses(dict.fromkeys(description.joints, 0.0))
-    T_tcp_base = se3.inverse(poses[tcp])
-    found = [np.zeros((1, 3))]
-    for link in links:
-        for part in description.links[link].collision:
-            if part.kind == "box":
-                steps = [np.linspace(-0.5, 0.5, max(2, round(edge / _GRAIN) + 1)) * edge for edge in part.size]
-                grid = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
-                found.append(se3.apply(T_tcp_base @ poses[link] @ part.T_link_primitive, grid))
-    return np.vstack(found)
-
-
-def _front(points: Array, ahead: Array, half_width: float, height: tuple[float, float]) -> tuple[float, float] | None:
-    """How far the parts of the hand that can meet the object reach ahead of the TCP, and how low the foremost does, m.
-
-    None: the hand goes over what is so thin.
-
-    Args:
-        points: (n, 3) of the hand's surface, axes of the base, from the TCP.
-        ahead: (3,) direction.
-        half_width: Of the object, across that direction, m.
-        height: Of the object's lower and upper face above the TCP, m.
-    """
-    across = np.abs(points @ np.cross(UP, ahead))
-    low, high = height
-    meets = points[(across <= half_width + _FLAT) & (points[:, 2] > low) & (points[:, 2] < high + _FLAT)]
-    if not len(meets):
-        return None
-    reach = meets @ ahead
-    front = float(reach.max())
-    return front, float(meets[reach > front - _FLAT, 2].min())
-
-
-def _direction(v: Array) -> Array:
-    return v / np.linalg.norm(v)

@@ -98,17 +98,30 @@ def test_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
     clocks = bench.collect(Clock, "/clock", QOS_CLOCK)
     bench.spin_sim(1.0)  # discovery is over
     psutil.cpu_percent()  # from here on
-    first, wall = bench.t_ns, time.monotonic()
+    simulation = bench.node._simulation
+    skipped, first, wall = simulation.skipped_s, bench.t_ns, time.monotonic()
     bench.spin_sim(3.0)
-    ratio = (bench.t_ns - first) * 1e-9 / (time.monotonic() - wall)
+    skipped = simulation.skipped_s - skipped  # of a machine that halted for more than 0.5 s; it is reported
+    ratio = ((bench.t_ns - first) * 1e-9 + skipped) / (time.monotonic() - wall)
     assert ratio == pytest.approx(1.0, abs=0.02)
     steps = np.diff([stamp_to_ns(m.header.stamp) for m in bench.joints])
     assert np.mean(steps == 10_000_000) > 0.98  # a tick each; a starved probe may miss some
     assert np.all(steps % 10_000_000 == 0)
     assert np.all(steps > 0)
-    assert factors
-    assert factors[-1].data == pytest.approx(1.0, abs=0.1)
+    bench.ros.spin_until(
+        lambda: factors and factors[-1].data == pytest.approx(1.0, abs=0.1), 30.0, "a real-time factor of 1"
+    )
     assert len(clocks) > 300
+    bench.ros.spin_until(
+        lambda: any(
+            float(value.value) == pytest.approx(simulation.skipped_s, abs=0.006)
+            for status in reports[-1].status
+            for value in status.values
+            if value.key == "wall_time_skipped_s"
+        ),
+        10.0,
+        "a report of what was skipped",
+    )
 
     def in_time() -> bool:
         """Of the last three seconds as they arrived, on two cores; where others take both, the bridge must say so."""

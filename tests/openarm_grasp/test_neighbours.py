@@ -94,3 +94,17 @@ def test_a_box_inside_of_what_is_held_goes():
     small = detection((0.26, 0.01, TABLE), (0.28, 0.03, TABLE + 0.02), kind="box")
     held = Box("target/x", se3.make(p=(0.27, 0.02, TABLE + 0.03)), np.array([0.1, 0.1, 0.08]))
     assert neighbours(sighting(BAR, small), (held,), CONFIG) == ()
+
+
+@pytest.mark.requirement("R-17")
+@pytest.mark.parametrize("reach", [0.008, 0.030])
+def test_what_reaches_over_an_object_a_little_does_not_stop_its_lift(reach):
+    low, high = (0.245, 0.045, TABLE), (0.315, 0.07, TABLE + 0.03)
+    edge = 0.07 - reach
+    over = detection((0.245, edge, TABLE + 0.036), (0.315, edge + 0.05, TABLE + 0.08))
+    points = lattice((0.245, edge, TABLE + 0.08), (0.315, edge + 0.05, TABLE + 0.08))
+    under = detection(low, high)
+    boxes = neighbours(sighting(under, over, points), (target_box(under, CONFIG),), CONFIG)
+    lifted = lattice(low, (*high[:2], TABLE + 0.12))
+    assert holds(boxes, lifted).any() == (reach > 0.015)
+    assert holds(boxes, points[points[:, 1] > 0.076], slack=0.005).all()  # beside it everything stays

@@ -50,6 +50,8 @@ class Heap:
             assert asked < 100
             there = [n for n, at in self.places.items() if all(np.hypot(*np.subtract(at, p)) > 0.05
                                                                for p in ask.exclude_near)]  # fmt: skip
+            if ask.object_at is not None:
+                there = [n for n in there if self.places[n] == ask.object_at]
             if not there:
                 order.done(ask, Code.UNKNOWN_OBJECT, "no more")
                 continue
@@ -80,10 +82,10 @@ def test_what_cannot_be_taken_is_listed_with_place_and_reason():
     heap, order = Heap(HEAP, {}, never=("middle", "lowest")), Order(("anything",))
     asked = heap.clear(order)
     assert heap.taken == ["top"]
-    assert asked == 7  # two in vain, one taken, none more; both again, none more
+    assert asked == 9  # two in vain, one taken, none more; both again, none more; each by its place
     assert order.outcome == "PARTIAL"
-    assert [(one.where, one.code) for one in order.left] == [(HEAP[n], Code.IN_COLLISION) for n in ("lowest", "middle")]
-    assert order.faults()[0] == "anything at (0.200, 0.000) m: IN_COLLISION: lowest has no room"
+    assert {one.where: one.code for one in order.left} == {HEAP[n]: Code.IN_COLLISION for n in ("lowest", "middle")}
+    assert "anything at (0.200, 0.000) m: IN_COLLISION: lowest has no room" in order.faults()
 
 
 def test_of_all_that_fits_the_easiest_is_asked_for():

@@ -10,8 +10,8 @@ import pytest
 
 from openarm_common.errors import Code
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.planning.pushes import closed_hand, push_ways
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
-from openarm_grasp.strategies.push import closed_hand, push_ways
 from tests.openarm_grasp.scripted import Follow, Grip
 
 
