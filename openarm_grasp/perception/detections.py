@@ -29,6 +29,8 @@ SAME_PLACE = 0.05
 _CLOUDS = 3
 #: What lies this near to points of an object is a piece of it, m.
 _PIECE = 0.010
+#: A point of an object is there in another frame with one as near to it, m; this share of all of them must be.
+_SAME_POINT, _MOST = 0.005, 0.95
 #: An object of fewer points has no cloud.
 _LEAST_POINTS = 60
 
@@ -196,6 +198,8 @@ def find(
         raise _not_measured(anchor)
     # A detector may miss a thing in one frame; in most of them it must be in its place.
     if 3 * len(track) < 2 * len(frames):
+        if clouds and _stays(frames, clouds[-1]):
+            return _sighting(frames, track[-1:], clouds[-1:], limits)
         blurred = [f for f in frames if any(not d.measured and _same_thing(d, anchor) for d in f.detections)]
         if 3 * (len(track) + len(blurred)) >= 2 * len(frames):
             raise _not_measured(anchor)
@@ -219,12 +223,21 @@ def find(
     limit = limits.agree_within if prism else 2.0 * limits.shape_agrees_within
     steps = [float(np.linalg.norm(a - b)) for a, b in pairwise(spots)]
     if steps and max(steps) > limit:
+        if not prism and _stays(frames, clouds[-1]):
+            return _sighting(frames, track[-1:], clouds[-1:], limits)
         raise UntrustedError(
             Code.STALE_DATA,
             f"{anchor.label!r} moved {max(steps) * 1e3:.1f} mm between two frames, expected at most"
             f" {limit * 1e3:.1f} mm; is it at rest?",
             anchor.p_base,
         )
+    return _sighting(frames, track, clouds, limits)
+
+
+def _sighting(
+    frames: Sequence[Frame], track: Sequence[Detection], clouds: Sequence[LabelledCloud], limits: DetectConfig
+) -> Sighting:
+    """The mean of sights of one object, and what else is in view."""
     target = average(track)
     mine = [cloud.points[cloud.labels == 1] for cloud in clouds[-_CLOUDS:]]
     shape = KDTree(np.concatenate(mine)) if mine else None
@@ -247,6 +260,19 @@ def _track(
         mine = _labelled(frame, track[-1])
         clouds += [mine] if mine is not None else []
     return track, clouds
+
+
+def _stays(frames: Sequence[Frame], cloud: LabelledCloud) -> bool:
+    """Whether what the newest frame shows of an object is there in two thirds of all, be it as a part of others.
+
+    Things that touch are one in some frames and several in others, and none of them has moved.
+    """
+    mine, there = cloud.points[cloud.labels == 1], 0
+    for frame in frames:
+        if frame.cloud is not None and (standing := frame.cloud.points[frame.cloud.labels > 0]).size:
+            away, _ = KDTree(standing).query(mine)
+            there += float(np.mean(away <= _SAME_POINT)) >= _MOST
+    return 3 * there >= 2 * len(frames)
 
 
 def _labelled(frame: Frame, detection: Detection) -> LabelledCloud | None:

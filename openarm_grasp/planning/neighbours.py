@@ -13,23 +13,33 @@ from dataclasses import replace
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.detection import Detection
+from openarm_common.detection import Detection, gap
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import UP, Box, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
 
+#: What stands this near to an object may keep a hand from it, m.
+_CLOSE = 0.04
 #: Edge of a column of points; points so far out of the box of a thing are its own, m.
 _STEP, _OUT = 0.005, 0.004
 #: A plan keeps so far from obstacles, and what is lifted touches none of them at first, m.
-_APART = 0.004
+_APART = 0.005
 #: Boxes about a thing, and the share of its volume that a further one must save.
 _MOST, _SAVED = 20, 0.02
+#: Boxes about points are this much smaller on each side: a plan keeps clear of them, and a grasp was found among the
+#: points themselves, m.
+_NEARER = 0.003
 #: What reaches over an object by no more than this slides off it when it is lifted, m.
 _OVER = 0.015
 #: Fewer points say nothing of a shape.
 _LEAST_POINTS = 30
+
+
+def crowded(found: Sighting) -> bool:
+    """Whether something stands so close to an object that it may keep a hand from it."""
+    return any(gap(found.target, one) < _CLOSE for one in found.others)
 
 
 def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tuple[Box, ...]:
@@ -45,11 +55,11 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     for one in found.others:
         whole = boxes[id(one)]
         own = points_of(found, one) if not (one.kind and one.measured) else np.empty((0, 3))
-        made = (
-            (whole,)
-            if len(own) < _LEAST_POINTS
-            else slabs(one.label, columns(own, one.bottom), _STEP, most=_MOST, saved=_SAVED)
-        )
+        if len(own) < _LEAST_POINTS:
+            made = (whole,)
+        else:
+            made = slabs(one.label, columns(own, one.bottom), _STEP, most=_MOST, saved=_SAVED)
+            made = tuple(replace(box, size=np.maximum(box.size - 2.0 * _NEARER, _STEP)) for box in made)
         parts += [replace(box, id=f"{whole.id}/{n}" if len(made) > 1 else whole.id) for n, box in enumerate(made)]
     for box in held:
         parts = [cut for part in parts if (cut := _beside(part, box)) is not None]

@@ -15,7 +15,7 @@ from math import ceil, cos, hypot, inf, pi, radians, sin
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.detection import Detection, gap
+from openarm_common.detection import Detection
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
@@ -30,8 +30,6 @@ from openarm_grasp.sampling.slabs import slabs
 _GRAIN = 0.005
 #: Points no further behind the foremost than this are at the front, m.
 _FLAT = 0.002
-#: What stands this near to an object may keep a hand from it, m.
-_CLOSE = 0.04
 #: Of a closed hand, this much from the tips on goes between things, m.
 _TIPS = 0.03
 #: Rows along a line in which things meet, those at the border of one slide past; how near they come to meet, m.
@@ -59,11 +57,6 @@ class Sweep:
     freed: Array
     heap: tuple[Box, ...]
     rest: tuple[Detection, ...]
-
-
-def crowded(found: Sighting) -> bool:
-    """Whether something stands so close to an object that it may keep a hand from it."""
-    return any(gap(found.target, one) < _CLOSE for one in found.others)
 
 
 def sweeps(found: Sighting, hand: Array, context: GraspContext) -> tuple[Sweep, ...]:

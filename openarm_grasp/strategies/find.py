@@ -17,6 +17,7 @@ from openarm_grasp.perception.detections import Frame, Sighting, UntrustedError,
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.arms import out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, little_turns, shorter
+from openarm_grasp.planning.neighbours import crowded
 from openarm_grasp.planning.options import NoWayError, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets
 from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
@@ -174,8 +175,8 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
         try:
             ways[arm] = run.ways(arm, sighting)
         except OpenArmError as error:
-            if error.code is not Code.IN_COLLISION:
-                raise  # it does not fit into a hand wherever it stands
+            if error.code is not Code.IN_COLLISION and not (error.code is Code.TOO_WIDE and crowded(sighting)):
+                raise  # it does not fit into a hand wherever it stands; what seems one thing in a crowd may be several
             run.findings.refusals[arm] = Verdict(error.code, error.message)
     where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
     for short, repeats, run.arm in product((False, True), (False, True), ways):

@@ -24,9 +24,10 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting, seen_at
 from openarm_grasp.planning.candidates import GraspCandidate, displaced
 from openarm_grasp.planning.feasibility import FeasibilityCheck
+from openarm_grasp.planning.neighbours import crowded
 from openarm_grasp.planning.offers import offers
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.planning.pushes import closed_hand, crowded, destinations, direction, push_ways, sweeps
+from openarm_grasp.planning.pushes import closed_hand, destinations, direction, push_ways, sweeps
 from openarm_grasp.requests.confirm import PUSH, agree
 from openarm_grasp.requests.request import Feasible, GraspOutcome
 from openarm_grasp.requests.task import Task

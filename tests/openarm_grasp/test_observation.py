@@ -251,3 +251,28 @@ def test_a_sighting_elsewhere_has_its_points_there_and_those_of_others_where_the
         off = (before.points[mine] - one.p_base)[:, [1, 0]] * (-1, 1)
         assert after.points[mine][:, :2] == pytest.approx(off + np.array([0.40, 0.1]), abs=1e-6)
         assert (after.points[~mine] == before.points[~mine]).all()
+
+
+@pytest.mark.requirement("R-17")
+def test_what_is_one_thing_in_some_frames_and_two_in_the_newest_is_taken_as_the_newest_shows_it() -> None:
+    one, other = (seen("anything", y=y, size=(0.06, 0.06, 0.05)) for y in (-0.2, -0.135))
+    both = seen("anything", y=-0.1675, size=(0.06, 0.125, 0.05))
+    apart_now = cloud_of(one, other)
+    together = replace(apart_now, labels=np.ones_like(apart_now.labels))
+    older = [Frame(i, (both,), together) for i in range(2)]
+    sighting = look([*older, Frame(2, (one, other), apart_now)], "anything", at=(0.26, -0.2))
+    assert sighting.target.p_base[1] == pytest.approx(-0.2)
+    assert sighting.target.size[1] == pytest.approx(0.06)
+    (cloud,) = sighting.clouds
+    assert np.count_nonzero(cloud.labels == 1) == 200
+    # one that was not there before has come
+    came = Frame(2, (one,), cloud_of(one))
+    gone = [Frame(i, (other,), cloud_of(other)) for i in range(2)]
+    with pytest.raises(OpenArmError) as error:
+        look([*gone, came], "anything")
+    assert error.value.code is Code.STALE_DATA
+    # and what slides is not two things
+    slid = [seen("anything", y=-0.2 + 0.025 * i, size=(0.06, 0.06, 0.05)) for i in range(3)]
+    with pytest.raises(OpenArmError) as error:
+        look([Frame(i, (d,), cloud_of(d)) for i, d in enumerate(slid)], "anything")
+    assert error.value.code is Code.STALE_DATA

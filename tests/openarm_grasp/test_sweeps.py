@@ -15,7 +15,8 @@ from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.pushes import closed_hand, crowded, push_ways, sweeps
+from openarm_grasp.planning.neighbours import crowded
+from openarm_grasp.planning.pushes import closed_hand, push_ways, sweeps
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from tests.openarm_grasp.scripted import HAND, Follow, World, robot_work, standing
 
