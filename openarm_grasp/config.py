@@ -98,6 +98,9 @@ class HeldConfig(Config):
     max_tcp_error: float = Field(
         default=0.008, gt=0.0, le=0.05, description="TCP this far from the grasp hit something, m"
     )
+    sag: float = Field(
+        default=0.02, ge=0.0, le=0.1, description="a lift that ends so near to its goal has ended; heavy things, m"
+    )
     slip: float = Field(
         default=0.003, gt=0.0, le=0.02, description="change of the gap on the way that counts as slipping, m"
     )

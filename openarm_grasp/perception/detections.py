@@ -199,7 +199,7 @@ def find(
     # A detector may miss a thing in one frame; in most of them it must be in its place.
     if 3 * len(track) < 2 * len(frames):
         if clouds and _stays(frames, clouds[-1]):
-            return _sighting(frames, track[-1:], clouds[-1:], limits)
+            return _sighting(frames[-1:], track[-1:], clouds[-1:], limits)
         blurred = [f for f in frames if any(not d.measured and _same_thing(d, anchor) for d in f.detections)]
         if 3 * (len(track) + len(blurred)) >= 2 * len(frames):
             raise _not_measured(anchor)
@@ -224,7 +224,7 @@ def find(
     steps = [float(np.linalg.norm(a - b)) for a, b in pairwise(spots)]
     if steps and max(steps) > limit:
         if not prism and _stays(frames, clouds[-1]):
-            return _sighting(frames, track[-1:], clouds[-1:], limits)
+            return _sighting(frames[-1:], track[-1:], clouds[-1:], limits)
         raise UntrustedError(
             Code.STALE_DATA,
             f"{anchor.label!r} moved {max(steps) * 1e3:.1f} mm between two frames, expected at most"

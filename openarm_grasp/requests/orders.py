@@ -134,8 +134,8 @@ class Order:
     _ended: dict[str, int] = field(default_factory=dict[str, int])
     _in_vain: int = 0
     _held: str = ""
-    _pressed: list[Spot] = field(default_factory=list[Spot])
-    _stirred: int = 0
+    _asked_by_place: list[Spot] = field(default_factory=list[Spot])
+    _pushed_in_vain: int = 0
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -161,7 +161,7 @@ class Order:
             if label in self.failed or (most and self.placed.count(label) >= most):
                 continue
             if self._ended.get(label) == len(self.placed):  # nothing has been taken away since
-                where = self._hard(label)
+                where = self._left_in_a_crowd(label)
                 if where is None:
                     continue
                 return GraspRequest(
@@ -174,15 +174,15 @@ class Order:
             )
         return None
 
-    def _hard(self, label: str) -> Spot | None:
+    def _left_in_a_crowd(self, label: str) -> Spot | None:
         """Where something was left that no hand has room around, and that was not asked for by its place yet."""
-        if self._stirred >= _IN_VAIN:
+        if self._pushed_in_vain >= _IN_VAIN:
             return None
         left = (one.where for one in self.left if one.label == label and one.code in NO_WAY)
-        return next((where for where in left if where is not None and not self._was_pressed(where)), None)
+        return next((where for where in left if where is not None and not self._was_asked_for(where)), None)
 
-    def _was_pressed(self, where: Spot) -> bool:
-        return any(math.dist(where, spot) < _SAME_SPOT for spot in self._pressed)
+    def _was_asked_for(self, where: Spot) -> bool:
+        return any(math.dist(where, spot) < _SAME_SPOT for spot in self._asked_by_place)
 
     def _spots(self, label: str) -> tuple[Spot, ...]:
         return () if self.bins is None else self.bins.bins[self.bins.of(label)].slots(self.bins.spacing)
@@ -224,9 +224,9 @@ class Order:
         unseen = seen is None and code in _NOT_SEEN
         self._in_vain = self._in_vain + 1 if (touched or unseen) and code is not Code.OK else 0
         if request.object_at is not None:
-            self._done_hard(label, request.object_at, touched=touched)
+            self._note_place(label, request.object_at, touched=touched)
         if code is Code.OK:
-            self._pressed, self._stirred = [], 0
+            self._asked_by_place, self._pushed_in_vain = [], 0
             self.placed.append(label)
             if len(placed) >= 2:
                 self._stand.append((float(placed[0]), float(placed[1])))
@@ -241,13 +241,13 @@ class Order:
                 self._ended[label], self._in_vain = len(self.placed), 0
         return next((one for one in self.left if one not in before), None)
 
-    def _done_hard(self, label: str, where: Sequence[float], *, touched: bool) -> None:
+    def _note_place(self, label: str, where: Sequence[float], *, touched: bool) -> None:
         """Note that what was left somewhere was asked for by its place; what moved may have freed something."""
         spot = (float(where[0]), float(where[1]))
-        self._pressed.append(spot)
+        self._asked_by_place.append(spot)
         self.left = [one for one in self.left if one.where is None or math.dist(one.where, spot) >= _SAME_SPOT]
         if touched:
-            self._stirred += 1
+            self._pushed_in_vain += 1
             self._ended.pop(label, None)
             self.left = [one for one in self.left if one.label != label]
 

@@ -278,7 +278,11 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
     except OpenArmError as error:
         if error.code is Code.GRASP_LOST:
             run.hand = Hand.AT_OBJECT
-        raise
+        end = grasp.candidate.T_base_tcp[:3, 3] + grasp.candidate.retreat_offset
+        sag = float(np.linalg.norm(robot.T_base_tcp(arm)[:3, 3] - end))
+        if error.code is not Code.EXECUTION_FAILED or sag > config.held.sag:
+            raise
+        robot.warn(f"lift: the {arm} arm gives way to the weight by {sag * 1e3:.0f} mm")
     evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
     frames = (await robot.observe(_LIFT_FRAMES)).frames
     gripper = grasp.judge(evidence, config.held, was_held=True)

@@ -265,6 +265,7 @@ def test_what_is_one_thing_in_some_frames_and_two_in_the_newest_is_taken_as_the_
     assert sighting.target.size[1] == pytest.approx(0.06)
     (cloud,) = sighting.clouds
     assert np.count_nonzero(cloud.labels == 1) == 200
+    assert [d.p_base[1] for d in sighting.others] == [pytest.approx(-0.135)]  # and not both of before
     # one that was not there before has come
     came = Frame(2, (one,), cloud_of(one))
     gone = [Frame(i, (other,), cloud_of(other)) for i in range(2)]

@@ -30,6 +30,25 @@ def test_a_miss_opens_backs_off_and_tries_another_way(world):
     assert first.candidates[0].id not in {way.id for way in second.candidates}
 
 
+@pytest.mark.parametrize("sag", [0.012, 0.030])
+def test_an_arm_that_gives_way_to_what_it_lifts_goes_on_and_one_that_is_blocked_does_not(world, sag):
+    follow = world.follow
+
+    async def heavy(arm, trajectory, what, **kwargs):
+        await follow(arm, trajectory, what, **kwargs)
+        if what == "lift":
+            grasp = world.done(PlanGrasp)[-1].candidates[0]
+            end = grasp.T_base_tcp.copy()
+            end[:3, 3] += grasp.retreat_offset - (0.0, 0.0, sag)
+            world.T_base_tcp = lambda arm: end
+            raise OpenArmError(Code.EXECUTION_FAILED, f"the tool ended {sag * 1e3:.0f} mm from its goal; blocked?")
+
+    world.follow = heavy
+    outcome = world.grasp()
+    assert outcome.success == (sag < 0.02), outcome.message
+    assert outcome.code is (Code.OK if sag < 0.02 else Code.EXECUTION_FAILED)
+
+
 @pytest.mark.requirement("A-71")
 def test_without_an_object_the_grasp_fails(worlds, box):
     """The object disappears after its detection: three attempts at most, never a success."""
