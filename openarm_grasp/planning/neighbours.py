@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from openarm_common import se3
 from openarm_common.detection import Detection, gap
@@ -20,6 +21,8 @@ from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import UP, Box, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
 
+#: Share of its hull that something without inward corners covers, seen from above.
+_FULL = 0.8
 #: What stands this near to an object may keep a hand from it, m.
 _CLOSE = 0.04
 #: Edge of a column of points; points so far out of the box of a thing are its own, m.
@@ -40,6 +43,18 @@ _LEAST_POINTS = 30
 def crowded(found: Sighting) -> bool:
     """Whether something stands so close to an object that it may keep a hand from it."""
     return any(gap(found.target, one) < _CLOSE for one in found.others)
+
+
+def cornered(found: Sighting) -> bool:
+    """Whether an object has corners that reach inwards, seen from above: it may be several things that touch."""
+    if found.target.kind or not found.clouds:
+        return False
+    cells = tops(np.concatenate([cloud.points[cloud.labels == 1].astype(np.float64) for cloud in found.clouds]))
+    try:
+        hull = ConvexHull(cells[:, :2]).volume
+    except QhullError:
+        return False  # all on one line
+    return len(cells) * _STEP**2 < _FULL * hull
 
 
 def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tuple[Box, ...]:

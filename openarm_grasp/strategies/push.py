@@ -24,7 +24,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting, seen_at
 from openarm_grasp.planning.candidates import GraspCandidate, displaced
 from openarm_grasp.planning.feasibility import FeasibilityCheck
-from openarm_grasp.planning.neighbours import crowded
+from openarm_grasp.planning.neighbours import cornered, crowded
 from openarm_grasp.planning.offers import offers
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.pushes import closed_hand, destinations, direction, push_ways, sweeps
@@ -103,8 +103,13 @@ async def push(task: Task) -> GraspOutcome | None:
 
 
 def _may_sweep(task: Task, found: Sighting) -> bool:
-    """Whether what stands around the object may be moved with it; what comes of that is not known beforehand."""
-    return crowded(found) and not task.request.dry_run
+    """Whether the object may be pushed with what the hand meets there; what comes of it is not known beforehand.
+
+    It stands in a crowd; or it leaves no room for a hand and has corners, so that it lies badly, or is several things.
+    """
+    outcome = task.outcome
+    blocked = outcome is not None and outcome.code is Code.IN_COLLISION and cornered(found)
+    return not task.request.dry_run and (crowded(found) or blocked)
 
 
 async def _plan(task: Task, found: Sighting) -> Push:

@@ -12,7 +12,7 @@ from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import Box, obstacle_boxes, target_box
-from openarm_grasp.planning.neighbours import neighbours
+from openarm_grasp.planning.neighbours import cornered, neighbours
 
 CONFIG = GraspConfig()
 TABLE = 0.4
@@ -108,3 +108,13 @@ def test_what_reaches_over_an_object_a_little_does_not_stop_its_lift(reach):
     lifted = lattice(low, (*high[:2], TABLE + 0.12))
     assert holds(boxes, lifted).any() == (reach > 0.015)
     assert holds(boxes, points[points[:, 1] > 0.076], slack=0.005).all()  # beside it everything stays
+
+
+def test_what_reaches_inwards_may_be_several_things():
+    legs, bar = np.concatenate([lattice(*leg) for leg in LEGS]), lattice((0.245, 0.045, TABLE), (0.315, 0.07, TABLE))
+    for target, points, expected in ((ANGLE, legs, True), (BAR, bar, False)):
+        cloud = LabelledCloud(points.astype(np.float32), np.ones(len(points), np.uint32), np.array([0.2, 0.0, 1.2]))
+        assert cornered(Sighting(target, (), 0, (cloud,))) is expected
+    assert not cornered(Sighting(ANGLE, (), 0))
+    line = LabelledCloud(bar[:20].astype(np.float32), np.ones(20, np.uint32), np.array([0.2, 0.0, 1.2]))
+    assert not cornered(Sighting(BAR, (), 0, (line,)))
