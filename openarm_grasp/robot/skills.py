@@ -172,6 +172,8 @@ class Skills:
         found: Sighting,
         candidate: GraspCandidate,
         after: Trajectory | None = None,
+        *,
+        turned: bool = False,
     ) -> Planned:
         """Plan how to put the object down; the map may still show it where it was, or below the hand that lifted it.
 
@@ -181,13 +183,18 @@ class Skills:
             found: The object before the grasp, and its neighbours.
             candidate: How the hand holds it.
             after: Trajectory whose end is the start; None starts at the present joints.
+            turned: It has turned in the hand: the map shows it around the hand, nobody knows how.
         """
         held = held_boxes(found.target, candidate, self._config)
         obstacles = neighbours(found, target_boxes(found.target, candidate, self._config), self._config)
         stood, lift = target_box(found.target, self._config), self._config.approach.lift_height
         grown = np.array([2.0 * _CELL, 2.0 * _CELL, lift])
         column = Box(stood.id, se3.make(p=(0.0, 0.0, 0.5 * lift)) @ stood.T_frame_box, stood.size + grown)
-        return await self.plan(PlanPlace(arm, tuple(ways), obstacles, held, after, (column,)))
+        ignored = [column]
+        if turned:
+            reach = 2.0 * float(np.linalg.norm(found.target.size))
+            ignored.append(Box(f"{stood.id}/hanging", se3.make(p=self.T_base_tcp(arm)[:3, 3]), np.full(3, reach)))
+        return await self.plan(PlanPlace(arm, tuple(ways), obstacles, held, after, tuple(ignored)))
 
     async def scene_version(self) -> int:
         """Version of the planning scene."""

@@ -287,7 +287,7 @@ async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why:
             return ready, ways[ready.chosen]
         run.enter(State.PLACE, f"the confirmed place has to be planned again: {why}")
     while True:
-        plan = await run.robot.plan_place(grasp.arm, ways, grasp.sighting, grasp.candidate)
+        plan = await run.robot.plan_place(grasp.arm, ways, grasp.sighting, grasp.candidate, turned=grasp.turned)
         target = ways[plan.chosen]
         why = await agreed(run, State.PLACE, grasp, f"place {target} with the {grasp.arm} arm", place=plan)
         if not why:

@@ -72,20 +72,25 @@ async def _leave(run: Run, grasp: Grasp, placed: Placed | None) -> None:
 async def _put_back(run: Run, grasp: Grasp) -> None:
     """Bring what the hand holds straight back; where the map shows what has slipped, by a plan that knows of it."""
     arm, robot, config, candidate = grasp.arm, run.robot, run.config, grasp.candidate
-    above = config.place.release_height
-    if run.failure is not None and run.failure.code is Code.GRASP_LOST:
+    above, slipped = config.place.release_height, run.failure is not None and run.failure.code is Code.GRASP_LOST
+    if slipped:
         above += 2.0 * config.held.slip_along  # it reaches lower than it did
     T_back = se3.make(p=above * candidates.UP) @ candidate.T_base_tcp
     try:
-        await robot.move_linear(arm, T_back, "put back")
+        try:
+            await robot.move_linear(arm, T_back, "put back")
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            target = grasp.sighting.target
+            way = replace(place_targets(target, candidate, (target.p_base[:2],), config)[0], T_base_tcp=T_back)
+            plan = await robot.plan_place(arm, (way,), grasp.sighting, candidate, turned=slipped)
+            for part in (plan.transfer, plan.approach):
+                await robot.follow(arm, part, "put back")
     except OpenArmError as error:
-        if error.code not in NO_WAY:
+        if not slipped or error.code is not Code.EXECUTION_FAILED:
             raise
-        target = grasp.sighting.target
-        way = replace(place_targets(target, candidate, (target.p_base[:2],), config)[0], T_base_tcp=T_back)
-        plan = await robot.plan_place(arm, (way,), grasp.sighting, candidate)
-        for part in (plan.transfer, plan.approach):
-            await robot.follow(arm, part, "put back")
+        robot.warn(f"{error.message}: what has turned in the hand meets something below, and is let go there")
 
 
 def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidates.Box, ...]:
