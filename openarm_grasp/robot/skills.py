@@ -183,7 +183,7 @@ class Skills:
             found: The object before the grasp, and its neighbours.
             candidate: How the hand holds it.
             after: Trajectory whose end is the start; None starts at the present joints.
-            turned: It has turned in the hand: the map shows it around the hand, nobody knows how.
+            turned: It has turned in the hand: the map shows it around the hand, and nobody knows how it hangs there.
         """
         held = held_boxes(found.target, candidate, self._config)
         obstacles = neighbours(found, target_boxes(found.target, candidate, self._config), self._config)
@@ -192,6 +192,7 @@ class Skills:
         column = Box(stood.id, se3.make(p=(0.0, 0.0, 0.5 * lift)) @ stood.T_frame_box, stood.size + grown)
         ignored = [column]
         if turned:
+            held = ()
             reach = 2.0 * float(np.linalg.norm(found.target.size))
             ignored.append(Box(f"{stood.id}/hanging", se3.make(p=self.T_base_tcp(arm)[:3, 3]), np.full(3, reach)))
         return await self.plan(PlanPlace(arm, tuple(ways), obstacles, held, after, tuple(ignored)))

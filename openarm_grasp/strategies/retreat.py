@@ -83,7 +83,11 @@ async def _put_back(run: Run, grasp: Grasp) -> None:
             if error.code not in NO_WAY:
                 raise
             target = grasp.sighting.target
-            way = replace(place_targets(target, candidate, (target.p_base[:2],), config)[0], T_base_tcp=T_back)
+            way = place_targets(target, candidate, (target.p_base[:2],), config)[0]
+            back = robot.T_base_tcp(arm)[:3, 3] - T_back[:3, 3]  # it has come that way
+            if back @ candidates.UP > 0.0:
+                way = replace(way, approach_offset=back)
+            way = replace(way, T_base_tcp=T_back)
             plan = await robot.plan_place(arm, (way,), grasp.sighting, candidate, turned=slipped)
             for part in (plan.transfer, plan.approach):
                 await robot.follow(arm, part, "put back")

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 
+from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.perception.detections import Frame
 from openarm_grasp.requests.request import GraspRequest
@@ -267,3 +269,32 @@ def test_every_transition_has_a_reason_and_begins_where_the_last_ended(world):
     world.grasp()
     assert all(status.reason for status in world.status)
     assert all(a.state is b.previous for a, b in pairwise(world.status))
+
+
+@pytest.mark.parametrize("meets", [False, True])
+def test_what_has_turned_in_the_hand_is_put_back_though_the_map_shows_it_there(world, meets):
+    """It is no obstacle of the way back, and where it meets the table before the hand is down it is let go."""
+    stood = world.objects["red"]
+
+    def lifted(label):  # seen by the camera as it hangs: far below the hand
+        world.objects[label] = replace(stood, T_base_object=se3.make(p=(0.0, 0.0, 0.04)) @ stood.T_base_object)
+
+    world.lifted, follow = lifted, world.follow
+    world.fail(lambda e: isinstance(e, MoveLinear) and e.what == "put back", Code.IN_COLLISION)
+
+    async def back(arm, trajectory, what, **kwargs):
+        await follow(arm, trajectory, what, **kwargs)
+        if what == "put back":
+            world.objects["red"] = stood
+            if meets and str(trajectory) == "put down":
+                raise OpenArmError(Code.EXECUTION_FAILED, "the tool ended 14 mm from its goal; blocked?")
+
+    world.follow = back
+    outcome = world.grasp()
+    assert outcome.code is Code.GRASP_LOST, outcome.message
+    assert outcome.attempts == 3
+    assert not outcome.held
+    for plan in world.done(PlanPlace):
+        assert plan.held == ()
+        assert len(plan.ignore_regions) == 2
+        assert plan.targets[0].approach_offset[2] > 0.05
