@@ -68,7 +68,7 @@ class Heap:
 HEAP = {"lowest": (0.2, 0.0), "middle": (0.26, 0.0), "top": (0.32, 0.0)}
 
 
-@pytest.mark.requirement("R-18")
+@pytest.mark.requirement("R-17")
 def test_a_heap_is_cleared_from_its_top_whatever_is_asked_for_first():
     heap, order = Heap(HEAP, {"lowest": "middle", "middle": "top"}), Order(("anything",))
     heap.clear(order)
@@ -77,7 +77,7 @@ def test_a_heap_is_cleared_from_its_top_whatever_is_asked_for_first():
     assert order.faults() == ()
 
 
-@pytest.mark.requirement("R-18", "P-02")
+@pytest.mark.requirement("R-17", "P-02")
 def test_what_cannot_be_taken_is_listed_with_place_and_reason():
     heap, order = Heap(HEAP, {}, never=("middle", "lowest")), Order(("anything",))
     asked = heap.clear(order)

@@ -118,7 +118,7 @@ def test_what_has_no_room_is_pushed_out_of_its_crowd_and_picked(pressed) -> None
     assert "through what is near it" in " ".join(pressed.notes)
 
 
-@pytest.mark.requirement("R-18")
+@pytest.mark.requirement("R-17")
 def test_the_easiest_object_is_not_pushed_for(pressed) -> None:
     outcome = pressed.ask("easiest red")
     assert (outcome.kind, outcome.code) == ("REFUSED", Code.IN_COLLISION)
