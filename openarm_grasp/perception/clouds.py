@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
-from openarm_common.detection import Detection
+from openarm_common.detection import Detection, gap
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_grasp.evidence.shapes import Cluster, ClusterFrame
-from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting
+from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart
 
 #: A place is in view where a point lies this near to it, seen from above, m.
 _IN_VIEW = 0.025
@@ -101,6 +101,20 @@ def stands(other: Detection, frames: Sequence[Frame]) -> bool:
     points = [cloud.points[cloud.labels > 0] for cloud in clouds]
     near = (np.linalg.norm(each[:, :2] - other.p_base[:2], axis=1) < _STANDS for each in points)
     return not clouds or any(bool(one.any()) for one in near)
+
+
+def came_next_to(now: Detection, before: Sequence[Detection], frames: Sequence[Frame], reach: float) -> bool:
+    """Whether something is seen next to a thing that was not there before.
+
+    Args:
+        now: The thing, as a frame shows it.
+        before: What was seen around before.
+        frames: Of which one has it.
+        reach: What is this near to it is next to it, m.
+    """
+    frame = next(frame for frame in reversed(frames) if any(d is now for d in frame.detections))
+    near = (d for d in frame.detections if d is not now and gap(d, now) < reach)
+    return any(all(apart(d, other) > SAME_PLACE for other in before) for d in near)
 
 
 def _around(clouds: Sequence[LabelledCloud]) -> Array:

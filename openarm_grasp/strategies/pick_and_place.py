@@ -23,6 +23,7 @@ from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.shapes import judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.perception.clouds import (
+    came_next_to,
     cluster_frames,
     cluster_of,
     nearest_to,
@@ -438,6 +439,9 @@ def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame
         return seen
     if now is None or not whole:
         text = "the border of the image or another thing hides a part of it: it is not known where its middle is"
+        return CameraVerdict(Code.PLACE_FAILED, text)
+    if before.cut and came_next_to(now, grasp.sighting.others, frames, _NEXT_TO):
+        text = "what is seen next to it was not there before: it may be a part of it, and its middle is not known"
         return CameraVerdict(Code.PLACE_FAILED, text)
     if before.cut and run.request.place is None and not run.request.place_choices:
         run.place_target = replace(placed.target, position=np.array([*now.p_base[:2], place[2]]))

@@ -14,7 +14,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.shapes import Cluster, ClusterFrame, judge_gone, judge_held, judge_moved, judge_rests
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
-from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.clouds import came_next_to
+from openarm_grasp.perception.detections import Frame, Sighting
 from openarm_grasp.planning.candidates import Box, GraspCandidate
 from openarm_grasp.requests.task import Grasp
 
@@ -178,3 +179,11 @@ def test_what_was_seen_in_part_must_be_seen_where_the_hand_has_moved_it(off, cod
     now = slab(0.27 + off, -0.2) @ T[:3, :3].T + T[:3, 3]
     assert judge_moved(part, T, now, HELD).code is code
     assert judge_moved(part, T, np.empty((0, 3)), HELD).code is Code.PLACE_FAILED
+
+
+def test_what_came_next_to_a_placed_thing_may_be_a_part_of_it():
+    size = np.array([0.06, 0.06, 0.04])
+    thing, stood = (Detection("anything", 0.9, se3.make(p=(x, -0.2, 0.42)), size) for x in (0.3, 0.38))
+    part = Detection("anything", 0.9, se3.make(p=(0.3, -0.12, 0.41)), np.array([0.02, 0.08, 0.02]))
+    for seen, expected in (((thing,), False), ((thing, stood), False), ((thing, stood, part), True)):
+        assert came_next_to(thing, (stood,), [Frame(1, seen), Frame(2, ())], 0.03) is expected
