@@ -32,6 +32,8 @@ _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
 #: Requests that moved an arm in vain, or saw nothing, one after the other, until a label is given up.
 _IN_VAIN = 3
+#: Things that are asked for by their places at most, one after the other in vain.
+_MOST = 10
 #: What is left so near to where something was left before is that, m.
 _SAME_SPOT = 0.02
 
@@ -176,7 +178,7 @@ class Order:
 
     def _left_in_a_crowd(self, label: str) -> Spot | None:
         """Where something was left that no hand has room around, and that was not asked for by its place yet."""
-        if self._pushed_in_vain >= _IN_VAIN:
+        if self._pushed_in_vain >= _IN_VAIN or len(self._asked_by_place) > 2 * _MOST:
             return None
         left = (one.where for one in self.left if one.label == label and one.code in NO_WAY)
         return next((where for where in left if where is not None and not self._was_asked_for(where)), None)
@@ -224,7 +226,7 @@ class Order:
         unseen = seen is None and code in _NOT_SEEN
         self._in_vain = self._in_vain + 1 if (touched or unseen) and code is not Code.OK else 0
         if request.object_at is not None:
-            self._note_place(label, request.object_at, touched=touched)
+            self._note_place(label, request.object_at, seen, touched=touched)
         if code is Code.OK:
             self._asked_by_place, self._pushed_in_vain = [], 0
             self.placed.append(label)
@@ -241,10 +243,10 @@ class Order:
                 self._ended[label], self._in_vain = len(self.placed), 0
         return next((one for one in self.left if one not in before), None)
 
-    def _note_place(self, label: str, where: Sequence[float], *, touched: bool) -> None:
+    def _note_place(self, label: str, where: Sequence[float], seen: Sequence[float] | None, *, touched: bool) -> None:
         """Note that what was left somewhere was asked for by its place; what moved may have freed something."""
         spot = (float(where[0]), float(where[1]))
-        self._asked_by_place.append(spot)
+        self._asked_by_place += [spot, *([] if seen is None else [(float(seen[0]), float(seen[1]))])]
         self.left = [one for one in self.left if one.where is None or math.dist(one.where, spot) >= _SAME_SPOT]
         if touched:
             self._pushed_in_vain += 1

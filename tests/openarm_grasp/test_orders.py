@@ -247,3 +247,18 @@ def test_what_was_placed_is_not_asked_for_again_by_another_word():
     order = Order(("cola", "can"), each=1)
     order.done(order.next(), Code.OK, "", (0.3, 0.2, 0.4))
     assert order.next() == GraspRequest("easiest can", exclude_near=((0.3, 0.2),))
+
+
+@pytest.mark.requirement("R-17")
+def test_an_order_ends_though_things_seem_to_stand_elsewhere_each_time():
+    order, rng, asked = Order(("anything",)), np.random.default_rng(0), 0
+    while ask := order.next():
+        asked += 1
+        assert asked < 60
+        easy = ask.object_at is None
+        if easy and len(ask.exclude_near) >= 4:
+            order.done(ask, Code.UNKNOWN_OBJECT, "no more")
+            continue
+        x, y = rng.uniform((0.2, -0.2), (0.4, 0.2))
+        order.done(ask, Code.IN_COLLISION, "no room", seen=(x, y, 0.4))
+    assert order.outcome == "FAILED"
