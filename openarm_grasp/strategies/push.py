@@ -70,8 +70,10 @@ class Push:
 async def push(task: Task) -> GraspOutcome | None:
     """Push an object that no arm can grasp where it is into reach, observe, and pick it; several times if need be."""
     refused = task.outcome
-    if refused is None or task.findings.place_refused or EASIEST in task.request.label.casefold().split():
-        return None  # the easiest object is that for which nothing need be pushed
+    if refused is None or task.findings.place_refused:
+        return None
+    if EASIEST in task.request.label.casefold().split() and crowded(task.findings.need_sighting()):
+        return None  # the easiest object is that for which nothing else need be moved
     for number in range(1, task.context.config.push.most + 1):
         found = task.findings.need_sighting()
         if not (found.target.measured or _may_sweep(task, found)):
