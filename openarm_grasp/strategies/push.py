@@ -72,8 +72,9 @@ async def push(task: Task) -> GraspOutcome | None:
     refused = task.outcome
     if refused is None or task.findings.place_refused:
         return None
-    if EASIEST in task.request.label.casefold().split() and crowded(task.findings.need_sighting()):
-        return None  # the easiest object is that for which nothing else need be moved
+    found = task.findings.need_sighting()
+    if _easiest(task) and crowded(found) and not found.target.kind:
+        return None  # others may be taken first, after which it may stand alone
     for number in range(1, task.context.config.push.most + 1):
         found = task.findings.need_sighting()
         if not (found.target.measured or _may_sweep(task, found)):
@@ -104,14 +105,19 @@ async def push(task: Task) -> GraspOutcome | None:
     return refused
 
 
+def _easiest(task: Task) -> bool:
+    return EASIEST in task.request.label.casefold().split()
+
+
 def _may_sweep(task: Task, found: Sighting) -> bool:
     """Whether the object may be pushed with what the hand meets there; what comes of it is not known beforehand.
 
     It stands in a crowd; or it leaves no room for a hand and has corners, so that it lies badly, or is several things.
+    For the easiest object nothing else is moved.
     """
     outcome = task.outcome
     blocked = outcome is not None and outcome.code is Code.IN_COLLISION and cornered(found)
-    return not task.request.dry_run and (crowded(found) or blocked)
+    return not (task.request.dry_run or _easiest(task)) and (crowded(found) or blocked)
 
 
 async def _plan(task: Task, found: Sighting) -> Push:
