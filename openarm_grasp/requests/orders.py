@@ -226,7 +226,7 @@ class Order:
         unseen = seen is None and code in _NOT_SEEN
         self._in_vain = self._in_vain + 1 if (touched or unseen) and code is not Code.OK else 0
         if request.object_at is not None:
-            self._note_place(label, request.object_at, seen, touched=touched)
+            self._note_place(label, request.object_at, seen, touched=touched, gone=code in _GONE and seen is None)
         if code is Code.OK:
             self._asked_by_place, self._pushed_in_vain = [], 0
             self.placed.append(label)
@@ -243,15 +243,21 @@ class Order:
                 self._ended[label], self._in_vain = len(self.placed), 0
         return next((one for one in self.left if one not in before), None)
 
-    def _note_place(self, label: str, where: Sequence[float], seen: Sequence[float] | None, *, touched: bool) -> None:
-        """Note that what was left somewhere was asked for by its place; what moved may have freed something."""
+    def _note_place(
+        self, label: str, where: Sequence[float], seen: Sequence[float] | None, *, touched: bool, gone: bool
+    ) -> None:
+        """Note that what was left somewhere was asked for by its place; what moved may have freed something.
+
+        What is not seen there any more stays on the list of what was left.
+        """
         spot = (float(where[0]), float(where[1]))
         self._asked_by_place += [spot, *([] if seen is None else [(float(seen[0]), float(seen[1]))])]
-        self.left = [one for one in self.left if one.where is None or math.dist(one.where, spot) >= _SAME_SPOT]
+        here = [one for one in self.left if one.where is not None and math.dist(one.where, spot) < _SAME_SPOT]
+        again = [one for one in self.left if touched and one.label == label and one not in here]
+        self.left = [one for one in self.left if one not in again and (gone or one not in here)]
         if touched:
             self._pushed_in_vain += 1
             self._ended.pop(label, None)
-            self.left = [one for one in self.left if one.label != label]
 
     def _none_left(self, label: str, code: Code, message: str) -> None:
         """Nothing more of a label is in view besides what was left: that is tried again if it may have become free."""

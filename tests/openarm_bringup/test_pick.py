@@ -167,6 +167,6 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     assert outcome.text == "left: anything at (0.200, 0.100) m: TOO_WIDE: 190 mm\n"
     data = json.loads(json.dumps(outcome.data, allow_nan=False))
     assert data["left"][0]["where"] == [0.2, 0.1]
-    assert [row["place"] for row in data["results"]] == [[0.2, 0.3, 0.4], None, None]
+    assert [row["place"] for row in data["results"]] == [[0.2, 0.3, 0.4], None, None, None]
     assert asked[0]["place_choices"] == ((0.2, 0.26), (0.2, 0.38))
     assert asked[2]["exclude_near"] == ((0.2, 0.3), (0.2, 0.1))

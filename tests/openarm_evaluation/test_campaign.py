@@ -169,14 +169,11 @@ def trials(task, tmp_path, **kwargs) -> trial.Trials:
 
 @pytest.mark.requirement("P-14")
 def test_a_refusal_keeps_its_reason_when_nothing_else_is_in_view(tmp_path, monkeypatch) -> None:
-    """The order asks for another object of the label, and there is none."""
+    """The order asks for another object of the label, and there is none, then for that one by its place."""
     run = trials(replace(make_task("nominal", 10001), labels=("anything",)), tmp_path)
-    answers = iter(
-        (
-            GraspOutcome(Code.TOO_WIDE, "90 mm, expected at most 80", "anything", object_position=(0.3, 0.1, 0.4)),
-            GraspOutcome(Code.UNKNOWN_OBJECT, "nothing is in view besides 1 that must stay", "anything"),
-        )
-    )
+    wide = GraspOutcome(Code.TOO_WIDE, "90 mm, expected at most 80", "anything", object_position=(0.3, 0.1, 0.4))
+    none = GraspOutcome(Code.UNKNOWN_OBJECT, "nothing is in view besides 1 that must stay", "anything")
+    answers = iter((wide, none, wide, none))
 
     def grasp(ask: GraspRequest) -> trial.Trial:
         answer = next(answers)

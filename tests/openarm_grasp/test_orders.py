@@ -262,3 +262,19 @@ def test_an_order_ends_though_things_seem_to_stand_elsewhere_each_time():
         x, y = rng.uniform((0.2, -0.2), (0.4, 0.2))
         order.done(ask, Code.IN_COLLISION, "no room", seen=(x, y, 0.4))
     assert order.outcome == "FAILED"
+
+
+@pytest.mark.requirement("R-17", "P-02")
+@pytest.mark.parametrize("touched", [False, True])
+def test_what_is_not_seen_any_more_where_it_was_left_stays_on_the_list(touched):
+    order = Order(("anything",))
+    order.done(order.next(), Code.OK, "", placed=(0.3, 1.0), seen=(0.3, 0.1, 0.4))
+    order.done(order.next(), Code.IN_COLLISION, "no room", seen=(0.26, 0.0, 0.4))
+    order.done(order.next(), Code.UNKNOWN_OBJECT, "no more")
+    ask = order.next()
+    assert ask.object_at == (0.26, 0.0)
+    order.done(ask, Code.UNKNOWN_OBJECT, "not there", touched=touched)
+    while ask := order.next():
+        order.done(ask, Code.UNKNOWN_OBJECT, "no more")
+    assert order.outcome == "PARTIAL"
+    assert [one.code for one in order.left] == [Code.IN_COLLISION]
