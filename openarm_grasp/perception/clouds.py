@@ -88,7 +88,7 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
             away = float(np.linalg.norm(now.centroid[:2] - before.centroid[:2]))
             if now.top - before.top >= rise and away <= 0.5 * (now.extent + before.extent):
                 found.append(points)
-    points, around = np.concatenate(found), _around(sighting.clouds[-1:])
+    points, around = np.concatenate(found), points_around(sighting.clouds[-1:])
     if not len(points) or not len(around):
         return points
     off, _ = KDTree(around).query(points)
@@ -117,7 +117,7 @@ def came_next_to(now: Detection, before: Sequence[Detection], frames: Sequence[F
     return any(all(apart(d, other) > SAME_PLACE for other in before) for d in near)
 
 
-def _around(clouds: Sequence[LabelledCloud]) -> Array:
+def points_around(clouds: Sequence[LabelledCloud]) -> Array:
     """Points (n, 3) of what stands around an object in clouds whose points labelled 1 are its."""
     return np.concatenate([np.empty((0, 3)), *(cloud.points[cloud.labels > 1].astype(np.float64) for cloud in clouds)])
 

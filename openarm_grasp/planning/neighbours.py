@@ -17,6 +17,7 @@ from openarm_common import se3
 from openarm_common.detection import Detection, gap
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.perception.clouds import object_points, points_around
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import UP, Box, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
@@ -49,7 +50,7 @@ def cornered(found: Sighting) -> bool:
     """Whether an object has corners that reach inwards, seen from above: it may be several things that touch."""
     if found.target.kind or not found.clouds:
         return False
-    cells = tops(np.concatenate([cloud.points[cloud.labels == 1].astype(np.float64) for cloud in found.clouds]))
+    cells = tops(object_points(found.clouds))
     try:
         hull = ConvexHull(cells[:, :2]).volume
     except QhullError:
@@ -66,10 +67,10 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
         config: Margins.
     """
     boxes = dict(zip(map(id, found.others), obstacle_boxes(found.others, config), strict=True))
-    parts = list[Box]()
+    seen, parts = points_around(found.clouds), list[Box]()
     for one in found.others:
         whole = boxes[id(one)]
-        own = points_of(found, one) if not (one.kind and one.measured) else np.empty((0, 3))
+        own = points_of(seen, one) if not (one.kind and one.measured) else seen[:0]
         if len(own) < _LEAST_POINTS:
             made = (whole,)
         else:
@@ -83,10 +84,8 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     return tuple(parts)
 
 
-def points_of(found: Sighting, one: Detection) -> Array:
-    """Points (n, 3) that belong to a neighbour of an object: those in the box about it; (0, 3) without clouds."""
-    clouds = [cloud.points[cloud.labels > 1].astype(np.float64) for cloud in found.clouds]
-    points = np.concatenate([np.empty((0, 3)), *clouds])
+def points_of(points: Array, one: Detection) -> Array:
+    """Points (n, 3) that are in the box about a thing."""
     local = se3.apply(se3.inverse(one.T_base_object), points)
     return points[(np.abs(local) <= 0.5 * one.size + _OUT).all(axis=1)]
 

@@ -21,6 +21,7 @@ from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
+from openarm_grasp.perception.clouds import object_points, points_around
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, tips_height
 from openarm_grasp.planning.neighbours import columns, points_of, tops
@@ -71,8 +72,8 @@ def sweeps(found: Sighting, hand: Array, context: GraspContext) -> tuple[Sweep, 
         context: Parameters and table.
     """
     config, floor = context.config, context.table.top_z
-    things = [_standing(_target_points(found), found.target, floor)]
-    things += [_standing(points_of(found, one), one, floor) for one in found.others]
+    things, around = [_standing(object_points(found.clouds), found.target, floor)], points_around(found.clouds)
+    things += [_standing(points_of(around, one), one, floor) for one in found.others]
     half = float(np.abs(hand[hand[:, 2] > hand[:, 2].max() - _TIPS, :2]).max()) + _MEET
     room = 2.0 * (half + config.push.gap)
     crowd = np.concatenate(things)[:, :2].mean(axis=0)
@@ -99,11 +100,6 @@ def sweeps(found: Sighting, hand: Array, context: GraspContext) -> tuple[Sweep, 
         out = float(ahead @ direction(things[0][:, :2].mean(axis=0) - crowd))
         ways.append((len(moved), whole - _OUTWARD * out, sweep))
     return tuple(sweep for _, _, sweep in sorted(ways, key=lambda way: way[:2]))
-
-
-def _target_points(found: Sighting) -> Array:
-    clouds = [cloud.points[cloud.labels == 1].astype(np.float64) for cloud in found.clouds]
-    return np.concatenate([np.empty((0, 3)), *clouds])
 
 
 def _standing(points: Array, one: Detection, floor: float) -> Array:

@@ -183,7 +183,7 @@ class Skills:
             found: The object before the grasp, and its neighbours.
             candidate: How the hand holds it.
             after: Trajectory whose end is the start; None starts at the present joints.
-            turned: It has turned in the hand: the map shows it around the hand, and nobody knows how it hangs there.
+            turned: It has turned in the hand: the map shows it around the hand, and how it hangs is not known.
         """
         held = held_boxes(found.target, candidate, self._config)
         obstacles = neighbours(found, target_boxes(found.target, candidate, self._config), self._config)

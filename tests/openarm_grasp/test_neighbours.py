@@ -107,7 +107,7 @@ def test_what_reaches_over_an_object_a_little_does_not_stop_its_lift(reach):
     boxes = neighbours(sighting(under, over, points), (target_box(under, CONFIG),), CONFIG)
     lifted = lattice(low, (*high[:2], TABLE + 0.12))
     assert holds(boxes, lifted).any() == (reach > 0.015)
-    assert holds(boxes, points[points[:, 1] > 0.076], slack=0.005).all()  # beside it everything stays
+    assert holds(boxes, points[points[:, 1] > 0.076], slack=0.005).all()  # outside of it everything stays
 
 
 def test_what_reaches_inwards_may_be_several_things():

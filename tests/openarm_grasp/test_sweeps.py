@@ -86,7 +86,7 @@ def test_a_crowd_is_what_stands_within_a_finger():
 
 
 def without_room(two: World) -> World:
-    """A robot that has no room around what it shall grasp until it has pushed."""
+    """A robot that has no room around what it is asked for until it has pushed."""
     plan = two.plan
 
     async def noted(request: PlanGrasp | PlanPlace) -> Planned:
@@ -108,7 +108,7 @@ def pressed(robot) -> World:
 
 @pytest.mark.requirement("R-17")
 def test_what_has_no_room_is_pushed_out_of_its_crowd_and_picked(pressed) -> None:
-    # no push is known to help: beside the crowd there is no place where it could be grasped
+    # no push is known to help: around the crowd there is no place where it could be grasped
     pressed.objects |= {
         f"wall{k}": standing(f"wall{k}", 0.26 + 0.13 * np.cos(k), 0.2 + 0.13 * np.sin(k)) for k in range(7)
     }
