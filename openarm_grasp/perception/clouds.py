@@ -12,7 +12,7 @@ from openarm_common.detection import Detection, gap
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_grasp.evidence.shapes import Cluster, ClusterFrame
-from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart
+from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart, object_points, points_around
 
 #: A place is in view where a point lies this near to it, seen from above, m.
 _IN_VIEW = 0.025
@@ -30,12 +30,6 @@ def cluster_of(sighting: Sighting) -> Cluster:
     """
     points = object_points(sighting.clouds[-1:])
     return Cluster.of(points, cut=not sighting.target.measured)
-
-
-def object_points(clouds: Sequence[LabelledCloud]) -> Array:
-    """Return the points (n, 3) of the object in clouds whose points labelled 1 are its."""
-    mine = (cloud.points[cloud.labels == 1].astype(np.float64) for cloud in clouds)
-    return np.concatenate([np.empty((0, 3)), *mine])
 
 
 def nearest_to(frames: Sequence[Frame], p_base: Array) -> tuple[Detection | None, Array]:
@@ -115,11 +109,6 @@ def came_next_to(now: Detection, before: Sequence[Detection], frames: Sequence[F
     frame = next(frame for frame in reversed(frames) if any(d is now for d in frame.detections))
     near = (d for d in frame.detections if d is not now and gap(d, now) < reach)
     return any(all(apart(d, other) > SAME_PLACE for other in before) for d in near)
-
-
-def points_around(clouds: Sequence[LabelledCloud]) -> Array:
-    """Points (n, 3) of what stands around an object in clouds whose points labelled 1 are its."""
-    return np.concatenate([np.empty((0, 3)), *(cloud.points[cloud.labels > 1].astype(np.float64) for cloud in clouds)])
 
 
 def _clusters(frame: Frame, cloud: LabelledCloud, place: Array) -> ClusterFrame:

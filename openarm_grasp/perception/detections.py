@@ -79,6 +79,17 @@ class UntrustedError(OpenArmError):
         self.where = where
 
 
+def object_points(clouds: Sequence[LabelledCloud]) -> Array:
+    """Return the points (n, 3) of the object in clouds whose points labelled 1 are its."""
+    mine = (cloud.points[cloud.labels == 1].astype(np.float64) for cloud in clouds)
+    return np.concatenate([np.empty((0, 3)), *mine])
+
+
+def points_around(clouds: Sequence[LabelledCloud]) -> Array:
+    """Points (n, 3) of what stands around an object in clouds whose points labelled 1 are its."""
+    return np.concatenate([np.empty((0, 3)), *(cloud.points[cloud.labels > 1].astype(np.float64) for cloud in clouds)])
+
+
 def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Frame, ...]:
     """Frames of detections in the base frame.
 

@@ -21,8 +21,7 @@ from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.clouds import object_points, points_around
-from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.detections import Sighting, object_points, points_around
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, tips_height
 from openarm_grasp.planning.neighbours import columns, points_of, tops
 from openarm_grasp.sampling.slabs import slabs

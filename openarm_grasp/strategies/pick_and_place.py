@@ -27,11 +27,10 @@ from openarm_grasp.perception.clouds import (
     cluster_frames,
     cluster_of,
     nearest_to,
-    object_points,
     risen_points,
     stands,
 )
-from openarm_grasp.perception.detections import Frame, apart
+from openarm_grasp.perception.detections import Frame, apart, object_points
 from openarm_grasp.planning.candidates import PlaceTarget, held_boxes
 from openarm_grasp.planning.place import place_targets, placing_error
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
