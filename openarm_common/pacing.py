@@ -25,10 +25,21 @@ class Pacer:
     """
 
     def __init__(self, period_ns: int, speed: float = 1.0, max_debt_ns: int = 500_000_000) -> None:
-        self._step_ns = round(period_ns / speed) if speed > 0.0 else 0
+        self._period_ns = period_ns
+        self.speed = speed
         self._max_debt_ns = max_debt_ns
         self._due_ns: int | None = None
         self.skipped_ns = 0
+
+    @property
+    def speed(self) -> float:
+        """Simulated seconds per second of wall time from the next tick on; 0 is as fast as possible."""
+        return self._speed
+
+    @speed.setter
+    def speed(self, speed: float) -> None:
+        self._speed = speed
+        self._step_ns = round(self._period_ns / speed) if speed > 0.0 else 0
 
     def wait_ns(self, now_ns: int) -> int:
         """Return the time until the next tick is due; 0 or less when it is."""
@@ -48,6 +59,38 @@ class Pacer:
     def restart(self) -> None:
         """Start again at the next call: after a pause, nothing is made up."""
         self._due_ns = None
+
+
+class AdaptiveSpeed:
+    """Speed at which what follows a simulation keeps up: additive increase, multiplicative decrease.
+
+    On a machine that is too slow for real time, simulated time goes slower, as in other simulators: messages come in
+    order and none too late, where they would else be lost and each node would find the others behind.
+
+    Source: Chiu and Jain, Analysis of the increase and decrease algorithms for congestion avoidance (1989).
+
+    Args:
+        most: Simulated seconds per second of wall time when all keep up.
+    """
+
+    #: A larger share of lost frames than this slows the simulation down.
+    _LOST = 0.1
+    _LEAST, _FASTER, _SLOWER = 0.2, 0.01, 0.9
+
+    def __init__(self, most: float) -> None:
+        self._most = self._speed = most
+        self._made = self._lost = 0
+
+    def update(self, made: int, lost: int) -> float:
+        """Return the speed, by all frames that were made and lost so far; to be called at an even rate."""
+        more, fewer = made - self._made, lost - self._lost
+        self._made, self._lost = made, lost
+        if more + fewer > 0:
+            if fewer > self._LOST * (more + fewer):
+                self._speed = max(self._LEAST * self._most, self._SLOWER * self._speed)
+            else:
+                self._speed = min(self._most, self._speed + self._FASTER * self._most)
+        return self._speed
 
 
 class RateDivider:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from std_msgs.msg import Float64
 
 from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.pacing import AdaptiveSpeed
 from openarm_common.resources import config_dir
 from openarm_common.ros.node import reliable, run, until_shutdown
 from openarm_common.scene.scene import load_scene
@@ -47,7 +49,7 @@ LARGE_PROFILE = "OPENARM_LARGE_MESSAGES_PROFILE"
 REPORT_PERIOD_S = 1.0
 #: Slower than this share of the requested speed is reported as a fault.
 _SLOW = 0.9
-#: Joint states that are further apart than this (p99, ms) are reported as a fault.
+#: Joint states that are further apart than this (p99, ms of simulated time) are reported as a fault.
 _LATE_MS = 15.0
 
 
@@ -99,7 +101,9 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         self.create_timer(REPORT_PERIOD_S, self._report, clock=self.steady_clock)
 
         if self._images is not None:
-            self.create_timer(WATCH_PERIOD_S, self._images.poll, clock=self.steady_clock)
+            adapts = 0.0 < config.speed <= 1.0 and not self._face.wall_stamps
+            self._speed = AdaptiveSpeed(config.speed) if adapts else None
+            self.create_timer(WATCH_PERIOD_S, partial(self._watch, self._images), clock=self.steady_clock)
             if not self._images.wait_ready(WARM_UP_S):
                 self.get_logger().warning(f"no image yet after {WARM_UP_S:.0f} s; the simulation begins without")
         self._states.publish_static(self.description)
@@ -145,6 +149,12 @@ class MujocoBridge(ControlNode[BridgeConfig]):
             environ[PROFILE] = environ[LARGE_PROFILE]
         return CameraFeed(setup, environ, first, self._on_no_images, self.config.speed)
 
+    def _watch(self, images: CameraFeed) -> None:
+        """Take the reports of the cameras, and slow simulated time down while they can't draw all frames."""
+        images.poll()
+        if self._speed is not None:
+            self._simulation.set_speed(self._speed.update(sum(images.rendered.values()), images.dropped))
+
     def _on_no_images(self, fault: str) -> None:
         if fault:
             self.get_logger().error(f"no images: {fault}")
@@ -170,12 +180,15 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         slow = not simulation.paused and config.speed > 0.0 and period.n > 100 and factor < _SLOW * config.speed
         if not fault and slow:
             fault = f"slower than requested: {factor:.2f} simulated seconds per second, expected {config.speed:g}"
+            if simulation.speed < config.speed:
+                fault += "; the machine draws no faster: lower rates or sizes of the cameras, or take a GPU"
+        late_ms = _LATE_MS / min(1.0, simulation.speed or 1.0)
         values = self._face.values()
-        if not fault and not simulation.paused and period.n > 100 and period.p99_ms > _LATE_MS:
+        if not fault and not simulation.paused and period.n > 100 and period.p99_ms > late_ms:
             commands = values.get("commands_per_s", 0)
             fault = (
                 f"late: one of a hundred joint states is {period.p99_ms:.0f} ms or more behind the one before, expected"
-                f" {_LATE_MS:.0f} at most; is the machine busy, or are {commands} commands a second too many?"
+                f" {late_ms:.0f} at most; is the machine busy, or are {commands} commands a second too many?"
             )
         self.diagnose(
             not fault,

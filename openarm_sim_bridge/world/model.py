@@ -61,6 +61,9 @@ class PhysicsConfig(Config):
         default="auto",
         description="of the constraints; auto: sparse from eight objects on, where it takes less time",
     )
+    sleep: bool = Field(
+        default=True, description="whether objects at rest are left out of the physics until something touches them"
+    )
     contact_solref: tuple[float, float] = Field(default=(0.005, 1.0), description="time constant (s) and damping ratio")
     contact_solimp: tuple[float, float, float, float, float] = Field(
         default=(0.95, 0.99, 0.001, 0.5, 2.0), description="impedance of contacts and of the finger coupling"

@@ -88,6 +88,7 @@ class Stage:
             objects=scene.objects,
             period_ns=period,
             encoders=self.encoders,
+            sleep=self._physics.sleep,
         )
 
     def compile(self, world: World, scene: Scene) -> CompiledWorld:

@@ -88,6 +88,7 @@ class World:
         objects: Free bodies to report, by the names of their free joints.
         period_ns: Length of a control tick.
         encoders: What commands and joint states go through; None is the truth.
+        sleep: Whether objects at rest are left out of the physics until something that moves touches them.
 
     Raises:
         OpenArmError: CONFIG_INVALID, as `compile`.
@@ -102,9 +103,11 @@ class World:
         objects: Sequence[SceneObject] = (),
         period_ns: int = PERIOD_NS,
         encoders: Encoders | None = None,
+        sleep: bool = True,
     ) -> None:
         self.joint_names = tuple(joint_names)
         self.period_ns = period_ns
+        self._sleep = int(mujoco.mjtEnableBit.mjENBL_SLEEP) if sleep else 0
         self.t_ns = 0
         self._home = dict(home)
         self._encoders = encoders or Encoders.exact(len(self.joint_names))
@@ -157,7 +160,10 @@ class World:
     def _advance(self, t_ns: int) -> None:
         steps = (t_ns - self.t_ns) // self._compiled.timestep_ns
         if steps > 0:
+            # In steps alone: whoever else computes with the model finds all bodies where they are.
+            self.model.opt.enableflags |= self._sleep
             mujoco.mj_step(self.model, self.data, nstep=steps)
+            self.model.opt.enableflags &= ~self._sleep
             self.t_ns += steps * self._compiled.timestep_ns
 
     # --- commands

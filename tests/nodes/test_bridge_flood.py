@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from openarm_interfaces.srv import SetPause
 from sensor_msgs.msg import JointState
 
-from openarm_common.ros.node import QOS_COMMAND
+from openarm_common.ros.node import QOS_COMMAND, reliable
 
 #: What a client gone wild sends, s and messages a second: right ones, ones of bad sizes and values, bytes that are no
 #: message, and messages of another type on a topic of the controller. It prints when it had sent how many.
@@ -63,7 +63,7 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp
         JointState,
         "/joint_states",
         lambda _raw, info: published.append(info["source_timestamp"]),
-        QOS_COMMAND,
+        reliable(1000),  # what a busy probe takes late is not lost
         raw=True,
     )
     ros.node.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, QOS_COMMAND)
@@ -95,15 +95,16 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp
         published.clear()
         heard = len(diagnostics)
         begin = sent()
-        ros.spin_until(lambda: len(published) > 400, 20.0, "four seconds of joint states")
+        ros.spin_until(lambda: len(published) > 1000, 60.0, "as many joint states as a report is about")
         periods = np.diff(published) * 1e-6
         end = sent()
         assert end[1] - begin[1] > 3000.0 * (end[0] - begin[0]) > 0.0, "no flood"
         reports = len(diagnostics)
         ros.spin_until(lambda: len(diagnostics) >= reports + 2, 20.0, "/diagnostics")
-        kept = abs(periods.mean() - 10.0) < 0.2 and np.percentile(periods, 99) <= 15.0
+        mean, p99 = periods.mean(), np.percentile(periods, 99)
+        kept = abs(mean - 10.0) < 0.2 and p99 <= 17.0  # 15 is reported, which is measured before they are published
         said = [report.status[0].message for report in diagnostics[heard:]]
-        assert kept or any(message.startswith(("late", "slower")) for message in said), (said, status())
+        assert kept or any(message.startswith(("late", "slower")) for message in said), (mean, p99, said, status())
         # It still listens to others.
         assert ros.call(ros.node.create_client(SetPause, "/sim/set_pause"), SetPause.Request(paused=True)).success
         ros.spin_until(lambda: status()["message"] == "paused", 20.0, "the pause on /diagnostics")

@@ -7,15 +7,17 @@ import time
 
 import numpy as np
 import pytest
+import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from openarm_interfaces.msg import ObjectStateArray
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64
 from tf2_msgs.msg import TFMessage
 
+from openarm_common.robot.folder import robot_folder
 from openarm_common.ros.convert import stamp_to_ns
-from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_TF, reliable
+from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_SENSOR, QOS_TF, reliable
 
 #: Hz of wall time from real time on, below of simulated time.
 RATES = {
@@ -62,3 +64,19 @@ def test_topics_keep_their_rates_at_the_speed_that_was_asked_for_or_it_says_why_
     wall_s = bench.joint_arrivals[-1] - bench.joint_arrivals[0]
     assert sim_s / wall_s < 1.2 * speed
     assert sim_s / wall_s > 0.7 * speed or told_slow()
+
+
+@pytest.mark.alone
+def test_simulated_time_goes_slower_where_the_machine_cannot_draw_the_images_in_time(bridge, tmp_path) -> None:
+    data = yaml.safe_load((robot_folder() / "cameras.yaml").read_text())
+    overhead = next(camera for camera in data["cameras"] if camera["name"] == "overhead")
+    data["cameras"] = [overhead | {"width": 1600, "height": 1200, "rate": 100.0}]
+    (tmp_path / "cameras.yaml").write_text(yaml.safe_dump(data))
+    bench = bridge(cameras=str(tmp_path / "cameras.yaml"))
+    bench.ros.node.create_subscription(Image, "/overhead/depth/image_raw", lambda _: None, QOS_SENSOR)
+    factors = bench.collect(Float64, "/sim/real_time_factor", reliable(5))
+    reports = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    bench.ros.spin_until(lambda: factors and factors[-1].data < 0.7, 20.0, "slower simulated time")
+    bench.ros.spin_until(
+        lambda: any("the machine draws no faster" in report.status[0].message for report in reports), 5.0, "a fault"
+    )

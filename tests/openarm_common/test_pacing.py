@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from openarm_common.pacing import Pacer, PeriodMeter, RateDivider, RealTimeFactor
+from openarm_common.pacing import AdaptiveSpeed, Pacer, PeriodMeter, RateDivider, RealTimeFactor
 
 MS = 1_000_000
 
@@ -91,3 +91,23 @@ def test_frames_keep_their_mean_rate_though_it_does_not_divide_the_ticks(rate: f
     gaps = np.diff(due) * 1e-9
     assert gaps.max() <= 1.0 / rate + 0.010 + 1e-9
     assert gaps.min() >= 1.0 / rate - 0.010 - 1e-9
+
+
+def test_a_simulation_slows_down_until_its_frames_are_made_and_goes_faster_again() -> None:
+    speed, made, lost = AdaptiveSpeed(1.0), 6, 0
+    assert speed.update(made, lost) == 1.0
+    assert speed.update(made, lost) == 1.0  # without a new frame there is nothing to go by
+
+    def settled(frames_per_update: int) -> float:
+        """Speed of a machine that makes so many of at most twelve frames."""
+        nonlocal made, lost
+        value = speed.update(made, lost)
+        for _ in range(200):
+            asked = round(12 * value)
+            made, lost = made + min(asked, frames_per_update), lost + max(0, asked - frames_per_update)
+            value = speed.update(made, lost)
+        return value
+
+    assert 0.4 < settled(6) < 0.65
+    assert settled(0) == pytest.approx(0.2)  # not at all is no use to anyone
+    assert settled(12) == 1.0

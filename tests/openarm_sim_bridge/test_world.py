@@ -278,3 +278,16 @@ def test_a_diverged_simulation_is_reported_and_a_reset_mends_it(
 def test_what_the_model_lacks_is_named(kwargs: dict, message: str) -> None:
     with pytest.raises(OpenArmError, match=message):
         World(spec(), **({"joint_names": JOINTS, "home": HOME} | kwargs))
+
+
+@pytest.mark.parametrize("sleep", [True, False])
+def test_an_object_at_rest_is_left_out_of_the_physics_until_another_touches_it(sleep: bool) -> None:
+    world = make(BALL.format(z=0.6) + CUBE.format(pos="0.5 0 0.03"), (BALL_OBJECT, CUBE_OBJECT), sleep=sleep)
+    cube, resting = world.model.body("cube").id, []
+    for _ in range(150):
+        world.step(world.steps_per_tick)
+        resting.append(world.data.body_awake[cube] == mujoco.mjtSleepState.mjS_ASLEEP)
+    assert resting[25] is sleep  # while the ball falls
+    assert not all(resting[30:])  # it lands on the cube
+    assert world.model.opt.enableflags == 0  # cameras and judges find every body where it is
+    assert sum(one.T_world_object[2, 3] > 0.02 for one in world.objects()) == 2
