@@ -51,15 +51,15 @@ def lives(name: str) -> bool:
     return True
 
 
-def watch(name: str, ended: Callable[[], object]) -> bool:
+def watch(name: str, ended: Callable[[], object]) -> Callable[[], None] | None:
     """Call a function, in a thread, when a lifeline ends.
 
     Args:
         name: Of the lifeline.
-        ended: Called once.
+        ended: Called once, unless the watch has ended before.
 
     Returns:
-        Whether there is such a lifeline on this machine.
+        Ends the watch; None when there is no such lifeline on this machine.
     """
     connection = socket.socket(socket.AF_UNIX)
     connection.setblocking(False)
@@ -67,13 +67,20 @@ def watch(name: str, ended: Callable[[], object]) -> bool:
         connection.connect(_address(name))
     except OSError:
         connection.close()
-        return False
+        return None
     connection.setblocking(True)
+    over = threading.Event()
 
     def wait() -> None:
         with connection, contextlib.suppress(OSError):
             connection.recv(1)
-        ended()
+        if not over.is_set():
+            ended()
+
+    def end() -> None:
+        over.set()
+        with contextlib.suppress(OSError):  # it has ended by itself
+            connection.shutdown(socket.SHUT_RDWR)
 
     threading.Thread(target=wait, name="lifeline", daemon=True).start()
-    return True
+    return end

@@ -101,7 +101,8 @@ class PlanningConfig(Config):
 class ExecutionConfig(Config):
     """How execution is watched."""
 
-    stale_after: float = Field(default=0.5, gt=0.05, le=5.0, description="age of /joint_states that counts as lost, s")
+    #: Fast DDS halts a publisher for a third of a second to a second while it opens the port of who has just ended.
+    stale_after: float = Field(default=1.2, gt=0.05, le=5.0, description="age of /joint_states that counts as lost, s")
     start_tolerance: float = Field(default=0.05, gt=0.0, le=0.5, description="a trajectory must begin this near, rad")
     goal_tolerance: float = Field(default=0.02, gt=0.0, le=0.5, description="joints must end this near, rad")
     tool_tolerance: float = Field(default=0.01, gt=0.0, le=0.5, description="the tool must end this near, m")

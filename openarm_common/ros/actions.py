@@ -140,7 +140,8 @@ class Watch:
         self._who = ""
         self._participants = set[str]()
         self._buried = set[str]()
-        self._watched = set[str]()
+        #: What ends the watch of a participant's lifeline.
+        self._watched = dict[str, Callable[[], None]]()
         #: Deaths that lifelines have said, and liveliness has not.
         self._foretold = 0
         #: Since when there has been no sign of life of a process that lives, monotonic; infinite: there is.
@@ -152,6 +153,8 @@ class Watch:
 
     def destroy(self) -> None:
         """End it."""
+        for end in self._watched.values():
+            end()
         self._node.destroy_subscription(self._subscription)
 
     def begin(self) -> Callable[[], str]:
@@ -165,6 +168,8 @@ class Watch:
         before = self.deaths
 
         def died() -> str:
+            if not self._who:  # who has just appeared may not have said its name yet
+                self._look()
             self._judge_silence()
             return (self._who or self._what) if self.deaths != before else ""
 
@@ -204,8 +209,8 @@ class Watch:
             self.deaths += 1
 
     def _watch(self, participant: str) -> None:
-        if participant not in self._watched and watch(participant, partial(self._bury, participant)):
-            self._watched.add(participant)
+        if participant not in self._watched and (end := watch(participant, partial(self._bury, participant))):
+            self._watched[participant] = end
 
     def _bury(self, participant: str) -> None:
         """Count the end of a process; in a thread of its own."""

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 #: A controller has this long beyond the duration, s.
 _OVERTIME = 5.0
-#: Joint states are lost when they are older, s.
-_LOST = 0.5
 
 
 class LiftMotions:
@@ -37,6 +35,7 @@ class LiftMotions:
         context: What plans start from.
         memory: What the hands hold.
         claim: Takes arms for as long as it is open.
+        stale_after: Age of joint states that counts as lost, s.
     """
 
     def __init__(
@@ -46,8 +45,10 @@ class LiftMotions:
         context: PlanningContext,
         memory: HeldObjects,
         claim: Callable[..., AbstractContextManager[None]],
+        stale_after: float,
     ) -> None:
         self._robot, self._arms, self._context, self._memory, self._claim = robot, arms, context, memory, claim
+        self._stale_after = stale_after
 
     async def move(
         self, goal: Array, request: MoveRequest, stopped: Callable[[], bool], answer: MoveAnswer
@@ -92,7 +93,7 @@ class LiftMotions:
         watch, goal = Watch(self._robot), controller.start(plan, 0)
 
         def check() -> None:
-            if watch.silence > _LOST:
+            if watch.silence > self._stale_after:
                 goal.cancel()
                 raise OpenArmError(Code.ROBOT_LOST, f"joint states have been silent for {watch.silence:.1f} s")
             if stopped():

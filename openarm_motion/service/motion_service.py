@@ -151,10 +151,10 @@ class MotionService:
         view = MapView(config.map, field, frames)
         self._context = PlanningContext(robot, arms, self.scene, self.memory, self.coordination, view, config)
         self.claims = ArmClaims()
-        lifted = (
-            (robot, arms, self._context, self.memory, self.claims.holding) if isinstance(arms, LiftedArms) else None
-        )
-        self._lift = LiftMotions(*lifted) if lifted else None
+        self._lift: LiftMotions | None = None
+        if isinstance(arms, LiftedArms):
+            lost = config.execution.stale_after
+            self._lift = LiftMotions(robot, arms, self._context, self.memory, self.claims.holding, lost)
 
     # --- plans and motions
     async def plan_approach(

@@ -27,7 +27,7 @@ from tf2_msgs.msg import TFMessage
 from openarm_bringup.bags.bag import open_bag
 from openarm_bringup.commands.record import check
 from openarm_bringup.supervision.graph import load_graph
-from openarm_bringup.supervision.shm import names_of, unused
+from openarm_bringup.supervision.shm import mapped_by, names_of, unused
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code
 from openarm_common.ros.node import QOS_STATIC_TF, QOS_TF
@@ -346,11 +346,12 @@ def test_the_graph_that_has_come_back_picks_two_objects_at_once_and_the_arms_kee
 def test_ctrl_c_leaves_no_process_and_no_shared_memory(up: Any) -> None:
     pids = up.pids()
     assert len(pids) >= 7
+    mine = mapped_by(os.getpid())
     began = time.monotonic()
     assert up.stop(signal.SIGINT) == 0
     assert time.monotonic() - began < 12.0
     assert [pid for pid in pids if psutil.pid_exists(pid)] == []
-    # A port that is in use belongs to another process that has joined this domain.
-    assert unused(names_of(up.domain)) == []
+    # A port that is in use belongs to another process that has joined this domain, as this one may have until now.
+    assert set(unused(names_of(up.domain))) <= mine
     assert up.record() is None
     assert "no process is left" in up.output.read_text()

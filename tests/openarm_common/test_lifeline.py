@@ -37,3 +37,17 @@ def test_it_ends_when_it_is_closed_and_is_known_only_meanwhile() -> None:
     line.close()
     assert ended.wait(20.0)
     assert not watch(name, ended.set)
+
+
+def test_a_watch_that_has_ended_says_nothing_and_leaves_no_thread() -> None:
+    name, ended = uuid.uuid4().hex, threading.Event()
+    line, before = Lifeline(name), set(threading.enumerate())
+    end = watch(name, ended.set)
+    assert end is not None
+    (thread,) = set(threading.enumerate()) - before
+    end()
+    thread.join(20.0)
+    assert not thread.is_alive()
+    line.close()
+    end()
+    assert not ended.is_set()

@@ -46,6 +46,8 @@ class FakeRobot:
     def __init__(self, node, description: RobotDescription, state: dict[str, float]) -> None:
         self.node, self.state = node, dict(state)
         self.t_ns = 1_000_000_000
+        #: Seconds of its time per second of the wall clock.
+        self.speed = float(FASTER)
         self.silent = False
         self.answer: Callable[[FollowJointTrajectory.Result], None] = lambda result: None
         self.stuck: set[str] = set()
@@ -80,7 +82,7 @@ class FakeRobot:
         }
 
     def _tick(self) -> None:
-        self.t_ns += FASTER * 10_000_000
+        self.t_ns += round(self.speed * 10_000_000)
         for start_ns, names, t, q in self.active.values():
             now = (self.t_ns - start_ns) * 1e-9
             for i, name in enumerate(names):
