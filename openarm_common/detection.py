@@ -113,8 +113,13 @@ def gap(a: Detection, b: Detection) -> float:
 def _nearest_corner(a: Detection, b: Detection) -> float:
     """Return the distance of the nearest corner of a box from another one, seen from above, m."""
     corners = (np.indices((2, 2)).reshape(2, -1).T - 0.5) * a.size[:2] @ a.T_base_object[:2, :2].T + a.p_base[:2]
-    local = (corners - b.p_base[:2]) @ b.T_base_object[:2, :2]
-    return float(np.linalg.norm(np.maximum(np.abs(local) - b.size[:2] / 2.0, 0.0), axis=1).min())
+    return float(distances_from(b, corners).min())
+
+
+def distances_from(one: Detection, xy: Array) -> Array:
+    """Return the horizontal distances (n,) of points (n, 2) from the box of an object, m; 0 within."""
+    local = (xy - one.p_base[:2]) @ one.T_base_object[:2, :2]
+    return np.asarray(np.linalg.norm(np.maximum(np.abs(local) - one.size[:2] / 2.0, 0.0), axis=1), dtype=np.float64)
 
 
 def kind_of(shape: str, size: Array) -> str:

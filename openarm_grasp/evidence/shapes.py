@@ -30,6 +30,8 @@ _SAME_THING = 0.3
 _LOWER, _LOWER_SHARE = 0.015, 0.25
 #: Of the points of a thing that has not moved so many lie where it was, %: the rest may be the edge of the hand.
 _MOST = 85.0
+#: Least horizontal part of a closing axis about which an end goes down, least turn, rad, and points that show it.
+_LEVEL, _TURNED, _LEAST_POINTS = 0.5, 0.12, 10
 #: What a camera over the table sees of a thing wherever it stands: the highest point in each cell of this edge, m.
 _CELL = 0.005
 
@@ -153,17 +155,48 @@ def judge_held(held: Sequence[Box], points: Array, config: HeldConfig) -> Camera
     return CameraVerdict(Code.OK, "it is where the hand should hold it")
 
 
-def judge_unmoved(before: Array, now: Array, config: HeldConfig) -> tuple[bool, str]:
+def heavier_end(before: Array, now: Array, T_base_tcp: Array) -> Array | None:
+    """Direction of the end of a thing that hangs lower in the hand than it should: its centre of mass is there.
+
+    What is held away from its centre of mass turns about the closing axis. Kanoulas et al. ("Center-of-mass-based grasp
+    pose adaptation using 3D range and force/torque sensing", IJHR 2018) feel that at the wrist; here it is seen.
+
+    Args:
+        before: (n, 3) points of it as it lay, base frame.
+        now: (n, 3) points of it in the hand, which has been lifted without a turn.
+        T_base_tcp: (4, 4) of the hand, whose y axis is the closing axis.
+
+    Returns:
+        (2,) unit vector at right angles to the closing axis; None where it has not turned, or the hand closes upright.
+    """
+    along = np.array([-T_base_tcp[1, 1], T_base_tcp[0, 1]])
+    level = float(np.linalg.norm(along))
+    if level < _LEVEL or min(len(before), len(now)) < _LEAST_POINTS:
+        return None
+    along /= level
+    turned = _slope(now, along) - _slope(before, along)
+    return None if abs(turned) < _TURNED else -np.sign(turned) * along
+
+
+def _slope(points: Array, along: Array) -> float:
+    """Angle of the line through points along a horizontal direction, rad."""
+    x, z = points[:, :2] @ along, points[:, 2]
+    x = x - x.mean()
+    return float(np.arctan2(x @ z, max(float(x @ x), 1e-12)))
+
+
+def judge_unmoved(before: Array, now: Array, config: HeldConfig, around: Array) -> tuple[bool, str]:
     """Whether a thing still stands where it was seen, as far as the hand above it lets the camera see.
 
     Args:
         before: (n, 3) points of it as it was seen before.
         now: (n, 3) points of what is seen there now.
         config: Thresholds.
+        around: (n, 3) points of what stood around it, which may be seen as one with it now.
     """
     if len(now) < _SAME_THING * len(before) or not len(before):
         return True, "the hand hides the object"
-    away, _ = KDTree(before).query(now)
+    away, _ = KDTree(np.concatenate([before, around])).query(now)
     off, limit = 1e3 * float(np.percentile(away, _MOST)), 1e3 * config.moved
     if off > limit:
         return False, f"the object has moved: it reaches {off:.0f} mm out of where it stood, expected {limit:.0f}"

@@ -8,16 +8,28 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
+from openarm_common import se3
 from openarm_common.detection import Detection, gap
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_grasp.evidence.shapes import Cluster, ClusterFrame
-from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart, object_points, points_around
+from openarm_grasp.perception.detections import (
+    NEXT_TO,
+    SAME_PLACE,
+    Frame,
+    Sighting,
+    apart,
+    in_box,
+    object_points,
+    points_around,
+)
 
 #: A place is in view where a point lies this near to it, seen from above, m.
 _IN_VIEW = 0.025
 #: What is seen this near to what stood there is that, and what is seen this near to its middle may be, m.
 _STOOD, _STANDS = 0.015, 0.025
+#: What has risen with a thing is seen this near to where it is then, m; a part is seen so by more than this share.
+_PART, _MOST = 0.008, 0.5
 #: Fewer points are no cluster.
 _LEAST_POINTS = 30
 
@@ -87,6 +99,34 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
         return points
     off, _ = KDTree(around).query(points)
     return points[off > _STOOD]
+
+
+def came_along(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_before: Array) -> tuple[Detection, ...]:
+    """Return what lay next to a thing and has risen with it as one body: it is a part of it.
+
+    An image does not distinguish things that touch from parts of one thing; a motion does (Katz and Brock,
+    "Manipulating articulated objects with interactive perception", ICRA 2008).
+
+    Args:
+        frames: Since the lift, in the base frame.
+        sighting: The thing as it stood, and what was around it.
+        risen: (n, 3) of `risen_points`.
+        T_now_before: (4, 4) how the hand has moved since it took hold.
+    """
+    around = points_around(sighting.clouds[-1:])
+    clouds = [frame.cloud.points[frame.cloud.labels > 0] for frame in frames[-1:] if frame.cloud is not None]
+    if not len(risen) or not clouds:
+        return ()
+    up, now, found = KDTree(risen), KDTree(clouds[0]), list[Detection]()
+    for one in (one for one in sighting.others if gap(one, sighting.target) < NEXT_TO):
+        points = around[in_box(around, one)]
+        if len(points) < _LEAST_POINTS:
+            continue
+        rose = float(np.mean(up.query(se3.apply(T_now_before, points))[0] < _PART))
+        stays = float(np.mean(now.query(points)[0] < _PART))
+        if rose > _MOST and stays < 1.0 - _MOST:
+            found.append(one)
+    return tuple(found)
 
 
 def stands(other: Detection, frames: Sequence[Frame]) -> bool:

@@ -13,24 +13,31 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from openarm_common import se3
-from openarm_common.detection import Detection
+from openarm_common.detection import Detection, distances_from
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.labelled_cloud import LabelledCloud
-from openarm_common.types import Array
+from openarm_common.types import Array, Floats
 from openarm_common.wanted import describe, select
 from openarm_grasp.config import DetectConfig
 
 #: An object that is chosen by its position is no farther from it than this, m.
 SAME_PLACE = 0.05
+#: Things nearer to each other than this may be parts of one, m.
+NEXT_TO = 0.03
+#: Where the middle of an object is that is not asked for, what has that in its box is a part of it, or nearly, m.
+_PART = 0.01
 #: Clouds of so many frames are enough.
 _CLOUDS = 3
 #: What lies this near to points of an object is a piece of it, m.
 _PIECE = 0.010
 #: A point of an object is there in another frame with one as near to it, m; this share of all of them must be.
 _SAME_POINT, _MOST = 0.005, 0.95
+#: Points so far out of the box of a thing are its own, m.
+_OUT = 0.004
 #: An object of fewer points has no cloud.
 _LEAST_POINTS = 60
 
@@ -88,6 +95,40 @@ def object_points(clouds: Sequence[LabelledCloud]) -> Array:
 def points_around(clouds: Sequence[LabelledCloud]) -> Array:
     """Points (n, 3) of what stands around an object in clouds whose points labelled 1 are its."""
     return np.concatenate([np.empty((0, 3)), *(cloud.points[cloud.labels > 1].astype(np.float64) for cloud in clouds)])
+
+
+def in_box(points: Array | Floats, one: Detection) -> NDArray[np.bool_]:
+    """Which of the points (n, 3) are in the box about a thing."""
+    local = se3.apply(se3.inverse(one.T_base_object), points.astype(np.float64))
+    return np.asarray((np.abs(local) <= 0.5 * one.size + _OUT).all(axis=1), dtype=np.bool_)
+
+
+def joined(found: Sighting, parts: Sequence[Detection]) -> Sighting:
+    """An object together with what was taken for others, and is a part of it.
+
+    Args:
+        found: The object and what is around it.
+        parts: Of `found.others`.
+    """
+    clouds: list[LabelledCloud] = []
+    for cloud in found.clouds:
+        part = np.any([in_box(cloud.points, one) for one in parts], axis=0) & (cloud.labels > 1)
+        clouds.append(replace(cloud, labels=np.where(part, 1, cloud.labels).astype(np.uint32)))
+    whole = (found.target, *parts)
+    R, points = found.target.T_base_object[:3, :3], object_points(clouds)
+    local = points @ R
+    low, high = local.min(axis=0), local.max(axis=0)
+    low[2], high[2] = min(one.bottom for one in whole), max(one.top for one in whole)
+    target = replace(
+        found.target,
+        T_base_object=se3.make(R, R @ (0.5 * (low + high))),
+        size=high - low,
+        kind="",
+        round=False,
+        measured=all(one.measured for one in whole),
+    )
+    others = tuple(one for one in found.others if all(one is not part for part in parts))
+    return replace(found, target=target, others=others, clouds=tuple(clouds))
 
 
 def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Frame, ...]:
@@ -316,7 +357,8 @@ def _anchor(
 ) -> Detection:
     """The detection of the object that is asked for."""
     name = label or "the object"
-    chosen = [d for d in fitting if all(_from(d, p) > SAME_PLACE for p in exclude_near)]
+    stay = _excluded(fitting, exclude_near)
+    chosen = [d for d, stays in zip(fitting, stay, strict=True) if not stays]
     if not chosen:
         raise OpenArmError(
             Code.UNKNOWN_OBJECT, f"no {name!r} in view besides {len(fitting)} that must stay where they are"
@@ -329,6 +371,23 @@ def _anchor(
             raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {name!r} {limit}; it is seen at {there}")
         chosen = [min(near, key=lambda d: _from(d, at))]
     return next((d for d in chosen if d.measured), chosen[0])
+
+
+def _excluded(fitting: Sequence[Detection], exclude_near: Sequence[Sequence[float]]) -> NDArray[np.bool_]:
+    """Which detections stay where they are (bool).
+
+    Of each position: what is nearest to it and within `SAME_PLACE`; all that is nearer than half of that, and all that
+    has it in its box, as these may be parts of one object. What else stands close by is another object.
+    """
+    stay = np.zeros(len(fitting), dtype=np.bool_)
+    if not fitting or not exclude_near:
+        return stay
+    positions = np.array([p[:2] for p in exclude_near], dtype=np.float64)
+    away = np.array([[_from(d, p) for p in exclude_near] for d in fitting])
+    nearest = away.argmin(axis=0)
+    stay[nearest[away.min(axis=0) <= SAME_PLACE]] = True
+    in_box = np.array([distances_from(d, positions) <= _PART for d in fitting])
+    return stay | ((away <= SAME_PLACE / 2.0) | in_box).any(axis=1)
 
 
 def _same_thing(a: Detection, b: Detection) -> bool:

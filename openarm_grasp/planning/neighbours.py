@@ -14,10 +14,10 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from openarm_common import se3
-from openarm_common.detection import Detection, gap
+from openarm_common.detection import gap
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.perception.detections import Sighting, object_points, points_around
+from openarm_grasp.perception.detections import Sighting, in_box, object_points, points_around
 from openarm_grasp.planning.candidates import UP, Box, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
 
@@ -25,8 +25,8 @@ from openarm_grasp.sampling.slabs import slabs
 _FULL = 0.8
 #: What stands this near to an object may keep a hand from it, m.
 _CLOSE = 0.04
-#: Edge of a column of points; points so far out of the box of a thing are its own, m.
-_STEP, _OUT = 0.005, 0.004
+#: Edge of a column of points, m.
+_STEP = 0.005
 #: A plan keeps so far from obstacles, and what is lifted touches none of them at first, m.
 _APART = 0.005
 #: Boxes about a thing, and the share of its volume that a further one must save.
@@ -69,7 +69,7 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     seen, parts = points_around(found.clouds), list[Box]()
     for one in found.others:
         whole = boxes[id(one)]
-        own = points_of(seen, one) if not (one.kind and one.measured) else seen[:0]
+        own = seen[in_box(seen, one)] if not (one.kind and one.measured) else seen[:0]
         if len(own) < _LEAST_POINTS:
             made = (whole,)
         else:
@@ -83,18 +83,19 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     return tuple(parts)
 
 
-def points_of(points: Array, one: Detection) -> Array:
-    """Points (n, 3) that are in the box about a thing."""
-    local = se3.apply(se3.inverse(one.T_base_object), points)
-    return points[(np.abs(local) <= 0.5 * one.size + _OUT).all(axis=1)]
-
-
 def tops(points: Array) -> Array:
     """Highest point (n, 3) of each column of points, at its middle."""
-    cell, column = np.unique(np.floor(points[:, :2] / _STEP).astype(np.int64), axis=0, return_inverse=True)
-    top = np.full(len(cell), -np.inf)
-    np.maximum.at(top, column.reshape(-1), points[:, 2])
-    return np.column_stack([(cell + 0.5) * _STEP, top])
+    cells = np.floor(points[:, :2] / _STEP).astype(np.int64)
+    order = np.lexsort((cells[:, 1], cells[:, 0]))
+    cells = cells[order]
+    first = np.flatnonzero(np.diff(cells, axis=0, prepend=cells[:1] - 1).any(axis=1))
+    high = np.maximum.reduceat(points[order, 2], first)
+    return np.column_stack([(cells[first] + 0.5) * _STEP, high]).astype(np.float64)
+
+
+def standing_boxes(label: str, points: Array, floor: float, table_gap: float) -> tuple[Box, ...]:
+    """Boxes about what reaches from its highest points (n, 3) down to a height, and a gap above that, m."""
+    return slabs(label, columns(points, floor), _STEP, gap=table_gap)
 
 
 def columns(points: Array, floor: float) -> Array:

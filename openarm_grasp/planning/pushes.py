@@ -21,10 +21,9 @@ from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Sighting, object_points, points_around
+from openarm_grasp.perception.detections import Sighting, in_box, object_points, points_around
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, tips_height
-from openarm_grasp.planning.neighbours import columns, points_of, tops
-from openarm_grasp.sampling.slabs import slabs
+from openarm_grasp.planning.neighbours import standing_boxes, tops
 
 #: Between two points of a hand's shape, m.
 _GRAIN = 0.005
@@ -72,7 +71,7 @@ def sweeps(found: Sighting, hand: Array, context: GraspContext) -> tuple[Sweep, 
     """
     config, floor = context.config, context.table.top_z
     things, around = [_standing(object_points(found.clouds), found.target, floor)], points_around(found.clouds)
-    things += [_standing(points_of(around, one), one, floor) for one in found.others]
+    things += [_standing(around[in_box(around, one)], one, floor) for one in found.others]
     half = float(np.abs(hand[hand[:, 2] > hand[:, 2].max() - _TIPS, :2]).max()) + _MEET
     room = 2.0 * (half + config.push.gap)
     crowd = np.concatenate(things)[:, :2].mean(axis=0)
@@ -93,7 +92,7 @@ def sweeps(found: Sighting, hand: Array, context: GraspContext) -> tuple[Sweep, 
         p = R @ np.array([0.5 * (begin + far), aside, 0.0])
         size = np.array([far - begin + _GRAIN, 2.0 * half, tall])
         box = replace(found.target, T_base_object=se3.make(R, p + (floor + 0.5 * tall) * UP), size=size, round=False)
-        heap = slabs(found.target.label, columns(cells, floor), _GRAIN, gap=config.approach.table_gap)
+        heap = standing_boxes(found.target.label, cells, floor, config.approach.table_gap)
         rest = tuple(one for i, one in enumerate(found.others, start=1) if i not in moved)
         sweep = Sweep(box, p[:2] + whole * ahead, found.target.p_base[:2] + length * ahead, heap, rest)
         out = float(ahead @ direction(things[0][:, :2].mean(axis=0) - crowd))

@@ -32,6 +32,8 @@ _RAISED, _RAISED_AFTER_COLLISION = -1.6, 0.1
 _SAME_SIDES = -0.3
 #: What has turned in the hand is held nearer to its weight next: after each loss the lever counts so much more.
 _LOST = 2.0
+#: The weight is farther from the hand than this towards the end that hung lower, m; cosine of ends that are opposite.
+_FARTHER, _OPPOSITE = 0.01, -0.9
 #: A hand that met something on its way stays higher next: what it is lower than that costs so much, per m.
 _LOW = 60.0
 #: It met something, or could not get to the grasp for it.
@@ -47,17 +49,21 @@ class FailedGrasp:
         arm: Whose hand.
         R_base_tcp: (3, 3) orientation of the hand.
         offset: (3,) of its TCP from the middle of the object's lower face.
+        heavy: (2,) direction of the end of the object that hung lower than it should; None: not seen.
     """
 
     code: Code
     arm: str
     R_base_tcp: Array
     offset: Array
+    heavy: Array | None = None
 
     @classmethod
-    def of(cls, code: Code, arm: str, candidate: GraspCandidate, target: Detection) -> FailedGrasp:
+    def of(
+        cls, code: Code, arm: str, candidate: GraspCandidate, target: Detection, heavy: Array | None = None
+    ) -> FailedGrasp:
         """Remember a grasp of the object where it was seen."""
-        return cls(code, arm, candidate.T_base_tcp[:3, :3], _offset(candidate, target))
+        return cls(code, arm, candidate.T_base_tcp[:3, :3], _offset(candidate, target), heavy)
 
     def repeated_by(self, candidate: GraspCandidate, target: Detection) -> bool:
         """Whether a grasp of the object, where it is seen now, is the same, as far as can be told."""
@@ -130,7 +136,7 @@ def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence
     lost = sum(past.code is Code.GRASP_LOST for past in failed)
     for one in offered:
         score = _SAME_SIDES * max(past.sides(one) for past in failed)
-        score += _LOST * lost * one.parts.get("lever", 0.0)
+        score += _LOST * lost * weight_cost(one)
         if one.apertures is not None:  # boxes have raised grasps of their own
             height = _offset(one, target)[2]
             wanted = max((past.offset[2] + RAISE for past in failed if past.code in _MET), default=height)
@@ -140,6 +146,36 @@ def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence
     again = [any(past.repeated_by(one, target) for past in failed) for one in ranked]
     fresh = tuple(one for one, is_repeat in zip(ranked, again, strict=True) if not is_repeat)
     return Ways(fresh, tuple(one for one, is_repeat in zip(ranked, again, strict=True) if is_repeat))
+
+
+def weight_cost(one: GraspCandidate) -> float:
+    """Part of the score (0 or less) for the distance of the hand from the weight of the object; 0 for boxes."""
+    return one.parts.get("lever", 0.0) + one.parts.get("aside", 0.0)
+
+
+def centre_of_mass(solid: Array, target: Detection, failed: Sequence[FailedGrasp]) -> Array:
+    """Where the weight of an object is, as far as known: at first its density is taken to be even.
+
+    When an end of it has hung lower than it should, its weight is between the hand and that end: halfway, and by halves
+    again after the next grasp that has turned.
+
+    Args:
+        solid: (n, 3) points that fill it, base frame.
+        target: The object as it is seen now.
+        failed: What has failed so far.
+
+    Returns:
+        (3,) base frame.
+    """
+    foot, centre = np.array([*target.p_base[:2], target.bottom]), np.asarray(solid.mean(axis=0), dtype=np.float64)
+    turned = [(past.heavy, past.offset[:2]) for past in failed if past.heavy is not None]
+    for heavy, offset in turned:
+        held, now = float(offset @ heavy), float((centre - foot)[:2] @ heavy)
+        ends = [float(q @ heavy) for other, q in turned if float(other @ heavy) < _OPPOSITE]
+        end = min([float(((solid - foot)[:, :2] @ heavy).max()), *ends])
+        if now < held + _FARTHER:
+            centre[:2] += (0.5 * (held + max(held, end)) - now) * heavy
+    return centre
 
 
 def arms_to_try(arms: Sequence[str], failed: Sequence[FailedGrasp]) -> tuple[str, ...]:

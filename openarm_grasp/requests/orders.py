@@ -30,8 +30,10 @@ _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 #: With these the camera had not shown enough yet: another look may.
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
-#: Requests that moved an arm in vain, or saw nothing, one after the other, until a label is given up.
-_IN_VAIN = 3
+#: Requests in vain, one after the other, until a label is given up: that saw nothing, and that moved an arm.
+_UNSEEN, _IN_VAIN = 3, 6
+#: Pushes in vain, one after the other, until nothing more is pushed.
+_PUSHES = 3
 #: Things that are asked for by their places at most, one after the other in vain.
 _MOST = 10
 #: What is left so near to where something was left before is that, m.
@@ -178,7 +180,7 @@ class Order:
 
     def _left_in_a_crowd(self, label: str) -> Spot | None:
         """Where something was left that no hand has room around, and that was not asked for by its place yet."""
-        if self._pushed_in_vain >= _IN_VAIN or len(self._asked_by_place) > 2 * _MOST:
+        if self._pushed_in_vain >= _PUSHES or len(self._asked_by_place) > 2 * _MOST:
             return None
         left = (one.where for one in self.left if one.label == label and one.code in NO_WAY)
         return next((where for where in left if where is not None and not self._was_asked_for(where)), None)
@@ -212,7 +214,7 @@ class Order:
             code: Of the answer.
             message: Of the answer.
             placed: (x, y) where the object stands now, when it was placed.
-            seen: (x, y) where it was seen, when it was.
+            seen: (x, y) where it was seen last, when it was.
             touched: An arm has moved for it.
             held: A hand may hold it still: it is put down before anything else.
         """
@@ -239,7 +241,7 @@ class Order:
         else:
             where = None if seen is None else (float(seen[0]), float(seen[1]))
             self.left.append(Left(label, where, code, message, len(self.placed)))
-            if (where is None and not unseen) or self._in_vain >= _IN_VAIN:
+            if (where is None and not unseen) or self._in_vain >= (_UNSEEN if unseen else _IN_VAIN):
                 self._ended[label], self._in_vain = len(self.placed), 0
         return next((one for one in self.left if one not in before), None)
 

@@ -152,7 +152,8 @@ class GraspOutcome:
         arm: The arm that was used, or "".
         attempts: Physical attempts.
         place_position: (3,) target that was used, base frame, m; zeros when none.
-        object_position: (3,) where the object was seen last before it was lifted, base frame, m; None: it was not.
+        object_position: (3,) where the object was seen before it was lifted, or, where an arm moved in vain, since;
+            base frame, m; None: it was not.
         duration: s of robot time.
         held: The object is in the hand.
         moved: It is elsewhere than before, and not where it was asked for; the message says where.

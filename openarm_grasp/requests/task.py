@@ -7,7 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_common.wanted import fits
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.context import GraspContext
@@ -37,6 +39,8 @@ class Grasp:
         places: Ways to put the object down.
         closed: Aperture after the hand had closed on what is no box, m; None: it was not, or it is a box.
         turned: The camera has seen it turned or slipped in the hand, which does not put it where it should be then.
+        heavy: (2,) direction of the end that hung lower than it should, base frame, as the object lay; None: not seen.
+        adjacent: What lay so near that it may be a part of it.
     """
 
     arm: str
@@ -45,6 +49,8 @@ class Grasp:
     places: tuple[PlaceTarget, ...]
     closed: float | None = None
     turned: bool = False
+    heavy: Array | None = None
+    adjacent: tuple[Detection, ...] = ()
 
     @property
     def of_cloud(self) -> bool:

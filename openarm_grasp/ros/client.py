@@ -40,7 +40,8 @@ class GraspResult(Answer):
         arm: The arm that was used, or "".
         attempts: Physical attempts.
         place_position: (x, y, z) of the target on the table, base frame, m.
-        object_position: (x, y, z) where the object was seen last before it was lifted, base frame, m; None: it was not.
+        object_position: (x, y, z) where the object was seen before it was lifted, or where an arm moved in vain, since;
+            base frame, m; None: it was not.
         duration: s of robot time.
         route: "direct"; "hand_over": by way of the middle, with both arms; "push": pushed into reach; "" when it was
             not placed.

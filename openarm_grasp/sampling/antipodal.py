@@ -109,6 +109,7 @@ class Search:
         config: Of the search.
         approach: Distance and tilts.
         field: Distances to obstacles; read where the surface knows nothing.
+        centre: (3,) centre of mass of the target, base frame; None: of its volume.
     """
 
     def __init__(
@@ -118,9 +119,11 @@ class Search:
         config: CloudConfig,
         approach: ApproachConfig,
         field: DistanceField | None = None,
+        centre: Array | None = None,
     ) -> None:
         self._surface, self._shape, self._config, self._approach = surface, shape, config, approach
         self._field = field
+        self._centre = surface.voxel(surface.centroid if centre is None else centre)
         step = surface.step
         self._pads, self._tips = shape.pads / step, shape.tips / step
         self._margin = config.margin
@@ -235,8 +238,8 @@ class Search:
 
     def _bound(self, pairs: Array) -> Array:
         """About the best score (p,) of a hand at each pair."""
-        step, centre = self._surface.step, self._surface.voxel(self._surface.centroid)
-        off = (centre - pairs[:, :3])[:, :2]
+        step = self._surface.step
+        off = (self._centre - pairs[:, :3])[:, :2]
         level = np.maximum(np.linalg.norm(pairs[:, 3:5], axis=1), 1e-6)
         lever = np.abs(off[:, 0] * pairs[:, 4] - off[:, 1] * pairs[:, 3]) / level * step
         aside = np.abs((off * pairs[:, 3:5]).sum(axis=1)) / level * step
@@ -268,7 +271,7 @@ class Search:
             surface.cells, self._obstacles, surface.normals, self._pairs, hypotheses, shape.points / step, self._pads,
             self._tips, shape.opening / step, (self._shape.fingers[1] - self._shape.fingers[0]) / step,
             self._config.table_clearance / step, self._approach.pregrasp_distance / step,
-            surface.voxel(surface.centroid), self._fits(shape), self._least_cos, per_kind, enough,
+            self._centre, self._fits(shape), self._least_cos, per_kind, enough,
             int(self._why[0]) + self._config.poses, found, self._why,
         )  # fmt: skip
         self._good += count

@@ -22,7 +22,7 @@ from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate
-from openarm_grasp.planning.retries import FailedGrasp, proposed
+from openarm_grasp.planning.retries import FailedGrasp, centre_of_mass, proposed
 from openarm_grasp.sampling.antipodal import Antipodal, Search
 from openarm_grasp.sampling.hand_shape import HandShape
 from openarm_grasp.sampling.slabs import slabs
@@ -189,7 +189,9 @@ def _search(asked: Sampling) -> tuple[Search, Surface]:
         text = f"{what} is not known; expected it for grasp.sampler cloud: is the detector's segmentation on?"
         raise OpenArmError(Code.NOT_READY, text)
     config = asked.config
-    return Search(asked.surface, asked.shape, config.cloud, config.approach, asked.field), asked.surface
+    centre = centre_of_mass(asked.surface.solid, asked.target, asked.failed)
+    search = Search(asked.surface, asked.shape, config.cloud, config.approach, asked.field, centre)
+    return search, asked.surface
 
 
 def _none(search: Search, asked: Sampling, surface: Surface) -> OpenArmError:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from openarm_common import se3
 from openarm_common.types import Array
@@ -65,12 +66,35 @@ def _volume(points: Array, step: float) -> float:
 
 def _cut(points: Array, step: float) -> _Cut:
     """The best cut of a part; one that saves nothing where it is too small."""
-    whole, best = _volume(points, step), _Cut(0.0, 0, 0.0)
-    for axis in range(3):
-        low, high = float(points[:, axis].min()), float(points[:, axis].max())
-        for at in np.linspace(low, high, _CUTS + 2)[1:-1]:
-            below = points[:, axis] < at
-            if below.any() and not below.all():
-                saved = whole - _volume(points[below], step) - _volume(points[~below], step)
-                best = max(best, _Cut(saved, axis, float(at)))
-    return best
+    low, high = points.min(axis=0), points.max(axis=0)
+    places = np.linspace(low, high, _CUTS + 2)[1:-1]
+    lows, highs = _between_cuts(points, places)
+    # below[k] and above[k] are the boxes on the two sides of place k; none where a side is empty
+    below = np.maximum.accumulate(highs[:, :-1], axis=1) - np.minimum.accumulate(lows[:, :-1], axis=1) + step
+    reverse = (slice(None), slice(None, 0, -1))
+    above = np.maximum.accumulate(highs[reverse], axis=1) - np.minimum.accumulate(lows[reverse], axis=1) + step
+    saved = _volume(points, step) - np.prod(below, axis=2) - np.prod(above[:, ::-1], axis=2)
+    saved = np.where(np.isfinite(saved), saved, 0.0)
+    axis, place = np.argwhere(saved == saved.max())[-1]
+    if saved[axis, place] <= 0.0:
+        return _Cut(0.0, 0, 0.0)
+    return _Cut(float(saved[axis, place]), int(axis), float(places[place, axis]))
+
+
+@njit(cache=True)
+def _between_cuts(points: Array, places: Array) -> tuple[Array, Array]:
+    """Lowest and highest coordinates (3, n + 1, 3) of what lies between n places (n, 3) along each axis.
+
+    Where nothing lies the lowest ones are infinite, and the highest ones minus infinity.
+    """
+    n = len(places)
+    lows, highs = np.full((3, n + 1, 3), np.inf), np.full((3, n + 1, 3), -np.inf)
+    for i in range(len(points)):
+        for axis in range(3):
+            k = 0
+            while k < n and points[i, axis] >= places[k, axis]:
+                k += 1
+            for j in range(3):
+                lows[axis, k, j] = min(lows[axis, k, j], points[i, j])
+                highs[axis, k, j] = max(highs[axis, k, j], points[i, j])
+    return lows, highs

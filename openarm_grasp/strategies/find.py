@@ -3,21 +3,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING
 
-from openarm_common.detection import Detection
+from openarm_common.detection import Detection, gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.hand import HandParts
 from openarm_common.wanted import describe
 from openarm_grasp.evidence.verdicts import Verdict
-from openarm_grasp.perception.detections import Frame, Sighting, UntrustedError, in_view, on_table
+from openarm_grasp.perception.detections import (
+    NEXT_TO,
+    Frame,
+    Sighting,
+    UntrustedError,
+    in_box,
+    in_view,
+    joined,
+    on_table,
+    points_around,
+)
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.arms import out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, little_turns, shorter
-from openarm_grasp.planning.neighbours import crowded
+from openarm_grasp.planning.neighbours import crowded, standing_boxes
 from openarm_grasp.planning.options import NoWayError, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets
 from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
@@ -31,6 +41,8 @@ if TYPE_CHECKING:
 
 #: Share of the straight way to a grasp that is tried where none reaches.
 _SHORTEST = 0.35
+#: A grasp that costs so much more than another for its distance from the weight comes after it, on any line.
+_FAR_FROM_WEIGHT = 0.8
 #: An object that is observed so may be trusted in the next frames.
 _NOT_TRUSTED = (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT, Code.STALE_DATA)
 
@@ -52,7 +64,8 @@ async def find_grasp(run: Run, why: str) -> tuple[Grasp, Planned | None, str]:
         sighting = await detect(run, why)
         if run.kept is not None:
             grasp = grasp_of(run, run.kept.arm, sighting, run.kept.candidate)
-            grasp = run.grasp = replace(grasp, closed=run.kept.closed, turned=run.kept.turned)
+            grasp = replace(grasp, closed=run.kept.closed, turned=run.kept.turned, adjacent=run.kept.adjacent)
+            run.grasp = grasp
             why = f"the {grasp.arm} hand holds {run.label!r}; {len(grasp.places)} ways to place it"
             if run.request.dry_run:
                 _, target = await plan_place(run, grasp, grasp.places, why)
@@ -179,17 +192,19 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
                 raise  # it does not fit into a hand wherever it stands; what seems one thing in a crowd may be several
             run.findings.refusals[arm] = Verdict(error.code, error.message)
     where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
-    for short, repeats, run.arm in product((False, True), (False, True), ways):
-        offered = ways[run.arm].repeats if repeats else ways[run.arm].fresh
+    for (note, tier), short, run.arm in product(_tiers(ways), (False, True), ways):
+        offered = tier[run.arm]
         if short:
             refused = run.findings.refusals.get(run.arm)
             far = refused is not None and refused.code is Code.UNREACHABLE and not run.findings.place_refused
             offered = _farther(offered, run.context.hand) if far else ()
         if not offered:
             continue
-        run.options |= options_of(run.arm, offered, target, run.config.approach)
+        # also those far from the weight, whether they are needed or not
+        options = options_of(run.arm, (*ways[run.arm].fresh, *offered), target, run.config.approach)
+        run.options |= {key: option for key, option in options.items() if key not in run.options}
         text = f"{why}; trying the {run.arm} arm" if why else f"{target.label!r} stands at {where}"
-        text += f"; {len(offered)} ways to grasp it" + ("; all that is left has failed before" if repeats else "")
+        text += f"; {len(offered)} ways to grasp it{note}"
         text += " on shorter lines" if short else ""
         try:
             return await _plan_with(run, sighting, offered, text)
@@ -209,6 +224,23 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
             distances = {}
         why = f"{out_of_reach(f'{target.label!r} at {where}', distances)} ({why})"
     raise NoGraspError(codes.pop() if len(codes) == 1 else Code.NO_PLAN, why)
+
+
+def _tiers(ways: Mapping[str, retries.Ways]) -> tuple[tuple[str, Mapping[str, tuple[GraspCandidate, ...]]], ...]:
+    """Grasps by arm, in the order in which they are tried, with a note for the status.
+
+    Those near the weight of the object, on any line; those far from it; those that would repeat a failed one.
+    """
+    best = max((retries.weight_cost(one) for way in ways.values() for one in way.fresh), default=0.0)
+
+    def split(way: retries.Ways, *, far: bool) -> tuple[GraspCandidate, ...]:
+        return tuple(one for one in way.fresh if (retries.weight_cost(one) < best - _FAR_FROM_WEIGHT) is far)
+
+    return (
+        ("", {arm: split(way, far=False) for arm, way in ways.items()}),
+        (" far from its weight", {arm: split(way, far=True) for arm, way in ways.items()}),
+        ("; all that is left has failed before", {arm: way.repeats for arm, way in ways.items()}),
+    )
 
 
 def _farther(offered: Sequence[GraspCandidate], hand: HandParts) -> tuple[GraspCandidate, ...]:
@@ -270,10 +302,23 @@ def grasp_of(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) 
         spots = (check_position(request.place, target, others, table),)
     else:
         spots = free_spots(arm, target, others, run.config, run.context.shoulders, request.place_choices)
-    yaw = request.place_yaw
-    return Grasp(
-        arm, sighting, candidate, place_targets(target, candidate, spots, run.config, run.used_places, yaw=yaw)
-    )
+    places = place_targets(target, candidate, spots, run.config, run.used_places, yaw=request.place_yaw)
+    adjacent = tuple(d for d in others if d.measured and gap(d, target) < NEXT_TO)
+    return Grasp(arm, sighting, candidate, places, adjacent=adjacent)
+
+
+def with_parts(run: Run, grasp: Grasp, parts: Sequence[Detection]) -> Grasp:
+    """A grasp of an object together with what was taken for other objects, and is a part of it."""
+    around, candidate = points_around(grasp.sighting.clouds), grasp.candidate
+    if candidate.held:
+        table_gap = run.config.approach.table_gap
+        more = [
+            standing_boxes(f"{run.label}/part{n}", around[in_box(around, one)], one.bottom, table_gap)
+            for n, one in enumerate(parts)
+        ]
+        candidate = replace(candidate, held=sum(more, candidate.held))
+    run.findings.sighting, run.place_plan = joined(grasp.sighting, parts), None
+    return replace(grasp_of(run, grasp.arm, run.findings.sighting, candidate), closed=grasp.closed)
 
 
 async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> tuple[Planned, PlaceTarget]:

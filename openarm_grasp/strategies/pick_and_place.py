@@ -11,18 +11,19 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.detection import gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
-from openarm_grasp.evidence.shapes import judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
+from openarm_grasp.evidence.shapes import heavier_end, judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.perception.clouds import (
+    came_along,
     came_next_to,
     cluster_frames,
     cluster_of,
@@ -30,21 +31,21 @@ from openarm_grasp.perception.clouds import (
     risen_points,
     stands,
 )
-from openarm_grasp.perception.detections import Frame, apart, object_points
+from openarm_grasp.perception.detections import NEXT_TO, Frame, apart, object_points, points_around
 from openarm_grasp.planning.candidates import PlaceTarget, held_boxes
 from openarm_grasp.planning.place import place_targets, placing_error
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.requests.states import Hand, State, check_transition
 from openarm_grasp.requests.task import Grasp, Placed, Status, Task
 from openarm_grasp.robot.interface import Planned
-from openarm_grasp.robot.skills import reraise_stop
-from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place
+from openarm_grasp.robot.skills import STOPS, reraise_stop
+from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place, with_parts
 from openarm_grasp.strategies.retreat import retreat, still_held
 from openarm_grasp.strategies.run import Run
 from openarm_grasp.strategies.second_look import second_look
 
-#: Things nearer to each other than this may be parts of one, m.
-_NEXT_TO = 0.03
+#: After these another observation would wait for frames that do not come.
+_BLIND = (Code.NOT_READY, Code.STALE_DATA, Code.TIMEOUT)
 #: Frames that must not show the object in its old place after the lift: a detector may miss it in one.
 _LIFT_FRAMES = 2
 
@@ -73,6 +74,8 @@ async def pick_and_place(task: Task, request: GraspRequest) -> GraspOutcome:
     try:
         outcome = await _attempts(run)
     except OpenArmError as error:
+        if run.tried and not run.holding and error.code not in (*STOPS, *_BLIND):
+            await _see_where_it_is(run)
         late = error.code is Code.CANCELLED and 0.0 < request.timeout <= (robot.now_ns - run.began_ns) * 1e-9
         outcome = run.answer(Code.TIMEOUT if late else error.code, error.message)
     except Exception as error:
@@ -107,7 +110,7 @@ async def _attempts(run: Run) -> GraspOutcome:
             if plan is not None:
                 grasp, plan, why = await approach(run, grasp, plan, why)
                 grasp, why = await close(run, grasp, why)
-                gripper, camera, why = await lift(run, grasp, plan, why)
+                grasp, gripper, camera, why = await lift(run, grasp, plan, why)
                 if run.request.phase == "pick":
                     return succeeded(run, f"{why}; the {run.arm} hand keeps it", gripper=gripper, camera=camera)
             placed = await place(run, grasp, why)
@@ -127,6 +130,13 @@ async def _attempts(run: Run) -> GraspOutcome:
                 return succeeded(run, text, gripper=placed.gripper, camera=seen)
             run.failure = seen
         why = run.start_again(grasp, placed)
+
+
+async def _see_where_it_is(run: Run) -> None:
+    """Note where an object is that an arm has moved in vain; what is not seen is where it was seen last."""
+    with suppress(OpenArmError):  # what went wrong with the arm says more
+        frames = (await run.robot.observe_in_base(run.config.detect.frames)).frames
+        run.seen_at = run.request.find(frames, run.config.detect).target.p_base
 
 
 def succeeded(run: Run, message: str, *, gripper: GripperVerdict, camera: CameraVerdict) -> GraspOutcome:
@@ -227,7 +237,8 @@ def _still(grasp: Grasp, frames: Sequence[Frame], config: GraspConfig) -> tuple[
     """Whether the object still stands where it was seen; of what is no box, the points are compared."""
     if grasp.of_cloud:
         _, now = nearest_to(frames, grasp.sighting.target.p_base)
-        return judge_unmoved(object_points(grasp.sighting.clouds), now, config.held)
+        clouds = grasp.sighting.clouds
+        return judge_unmoved(object_points(clouds), now, config.held, points_around(clouds))
     return verdicts.judge_still(grasp.sighting.target, frames, config.held)
 
 
@@ -262,11 +273,11 @@ async def close(run: Run, grasp: Grasp, why: str) -> tuple[Grasp, str]:
     return grasp, gripper.reason
 
 
-async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[GripperVerdict, CameraVerdict, str]:
+async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, GripperVerdict, CameraVerdict, str]:
     """Lift straight up, then judge by gripper and camera whether the object has come along.
 
     Returns:
-        Both verdicts, and the reason.
+        The grasp, of all that has come along as one body; both verdicts, and the reason.
 
     Raises:
         OpenArmError: When they do not agree that it has.
@@ -290,13 +301,16 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
         place, before, radius = sighting.target.p_base, cluster_of(sighting), config.detect.match_radius
         camera = judge_gone(before, cluster_frames(frames, place), config.held, match_radius=radius)
         if camera.ok:
-            T = robot.T_base_tcp(arm)
-            held = [
-                replace(b, T_frame_box=T @ b.T_frame_box) for b in held_boxes(sighting.target, grasp.candidate, config)
-            ]
-            where = judge_held(held, risen_points(frames, sighting, config.held.rise), config.held)
+            T, points = robot.T_base_tcp(arm), risen_points(frames, sighting, config.held.rise)
+            moved = T @ se3.inverse(grasp.candidate.T_base_tcp)
+            if parts := came_along(frames, sighting, points, moved):
+                grasp = run.grasp = with_parts(run, grasp, parts)
+            boxes = held_boxes(grasp.sighting.target, grasp.candidate, config)
+            held = [replace(box, T_frame_box=T @ box.T_frame_box) for box in boxes]
+            where = judge_held(held, points, config.held)
             if not where.ok:
-                run.grasp, camera = replace(grasp, turned=True), where
+                heavy = heavier_end(object_points(sighting.clouds), points, T)
+                run.grasp, camera = replace(grasp, turned=True, heavy=heavy), where
     else:
         camera = verdicts.judge_sight(
             sighting.target,
@@ -311,7 +325,7 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
         run.hand = Hand.HOLDING if gripper.ok else Hand.AT_OBJECT
         raise OpenArmError(verdict.code, verdict.reason)
     run.hand = Hand.CARRYING
-    return gripper, camera, verdict.reason
+    return grasp, gripper, camera, verdict.reason
 
 
 # --- place
@@ -427,8 +441,7 @@ def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame
         seen = judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
     else:
         seen = judge_rests(before, rests, cluster_frames(frames, rests), config.place.tolerance)
-    beside = (d for d in grasp.sighting.others if d.measured and gap(d, grasp.sighting.target) < _NEXT_TO)
-    torn = next((d for d in beside if not before.cut and not stands(d, frames)), None)
+    torn = next((d for d in grasp.adjacent if not before.cut and not stands(d, frames)), None)
     if seen.ok and torn is not None:
         x, y = torn.p_base[:2]
         text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
@@ -439,7 +452,7 @@ def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame
     if now is None or not whole:
         text = "the border of the image or another thing hides a part of it: it is not known where its middle is"
         return CameraVerdict(Code.PLACE_FAILED, text)
-    if before.cut and came_next_to(now, grasp.sighting.others, frames, _NEXT_TO):
+    if before.cut and came_next_to(now, grasp.sighting.others, frames, NEXT_TO):
         text = "what is seen next to it was not there before: it may be a part of it, and its middle is not known"
         return CameraVerdict(Code.PLACE_FAILED, text)
     if before.cut and run.request.place is None and not run.request.place_choices:

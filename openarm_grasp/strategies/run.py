@@ -140,14 +140,15 @@ class Run:
             OpenArmError: With the failure, when no attempt is left or another would not help.
         """
         failure = self.failure or Verdict(Code.INTERNAL, "an attempt ended without a failure")
-        if failure.final or self.attempt >= self.config.limits.max_attempts:
-            raise OpenArmError(failure.code, failure.reason)
         same = grasp.sighting
-        self.failed += (retries.FailedGrasp.of(failure.code, grasp.arm, grasp.candidate, same.target),)
         if placed is not None:
             same = replace(same, target=standing_at(same.target, placed.target.position))
         phase = "all" if self.kept else self.request.phase
         self.request = replace(self.request.about(same), phase=phase)
+        if failure.final or self.attempt >= self.config.limits.max_attempts:
+            raise OpenArmError(failure.code, failure.reason)
+        target = grasp.sighting.target
+        self.failed += (retries.FailedGrasp.of(failure.code, grasp.arm, grasp.candidate, target, grasp.heavy),)
         self.attempt += 1
         self.missed = self.plans_failed = 0
         self.kept = None

@@ -57,4 +57,5 @@ def test_a_second_ctrl_c_is_the_emergency_stop(ros, tmp_path: Path) -> None:
     finally:
         command.kill()
         command.wait()
+        sys.stdout.write(printed.read_text())  # pytest shows it where the test fails
         server.destroy()

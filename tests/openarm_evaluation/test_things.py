@@ -19,6 +19,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
 from openarm_evaluation.campaign import report
 from openarm_evaluation.campaign.options import CampaignOptions
+from openarm_evaluation.campaign.tasks import things
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.things import REFUSED, object_sources
 from openarm_evaluation.campaign.trial import crashed_row
@@ -118,7 +119,7 @@ def test_tasks_name_each_object_in_turn_and_are_the_same_each_time(tmp_path) -> 
 def test_a_heap_lies_at_rest_on_the_table_and_all_of_it_is_requested(monkeypatch) -> None:
     monkeypatch.setattr(GraspJudge, "decide", lambda self, parts, T: Graspable(True))
     task = make_task("heap", 3, "superquadrics:40")
-    assert 3 <= len(task.scene.objects) <= 10
+    assert 5 <= len(task.scene.objects) <= 10
     assert task.labels == ("anything",) * len(task.scene.objects)
     assert task.clear
     assert make_task("heap", 3, "superquadrics:40") == task
@@ -130,6 +131,12 @@ def test_a_heap_lies_at_rest_on_the_table_and_all_of_it_is_requested(monkeypatch
         lowest.append(points[:, 2].min() - TOP)
     assert min(lowest) > -0.002
     assert min(lowest) < 0.002
+
+
+def test_a_heap_whose_objects_roll_off_the_table_is_refused(monkeypatch) -> None:
+    monkeypatch.setattr(things, "dropped", lambda *_: [])
+    with pytest.raises(OpenArmError, match="heap 3: fewer than 5 objects stay on the table in each of 20 drops"):
+        make_task("heap", 3, "superquadrics:40")
 
 
 def test_sources_of_objects_are_read_or_refused(tmp_path) -> None:

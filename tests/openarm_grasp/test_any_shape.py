@@ -3,20 +3,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from openarm_common import se3
+from openarm_common.errors import Code
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.scene.scene import Scene, load_scene, parse_scene
 from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.perception.detections import Frame, Sighting, in_box
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.sampling.views import views_of
+from openarm_grasp.strategies import find
 from openarm_grasp.strategies.registry import carry_out
+from openarm_grasp.strategies.run import Run
 
 
 def alone(name: str, x: float, y: float, yaw: float, side: int = 0) -> Scene:
@@ -70,15 +76,60 @@ def test_what_a_hand_keeps_is_judged_by_its_points_where_it_is_placed_later() ->
     assert "the cluster is" in outcome.message
 
 
-def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_that() -> None:
+def kept_banana() -> tuple[Trials, str]:
+    """Pick the banana; returns the arm that holds it."""
     senses = SimulatedSenses(depth_noise=True, detector="anything")
     task = Task("nominal", 1, alone("banana", 0.27, -0.22, 0.4), ("anything",))
     trials = Trials(task, senses, GraspConfig())
     trials.robot.pass_time(0.5)
     assert trials.link.run(carry_out(trials.grasp_task(GraspRequest("anything", phase="pick")))).success
-    ((arm, kept),) = trials.session.kept.items()
+    (arm,) = trials.session.kept
+    return trials, arm
+
+
+def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_that() -> None:
+    trials, arm = kept_banana()
+    kept = trials.session.kept[arm]
     assert not kept.turned
     trials.session.kept[arm] = replace(kept, turned=True)
     outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
     assert (outcome.success, outcome.attempts) == (True, 2), outcome.message  # it is taken up again from there
     assert any("it had turned or slipped in the hand" in step.reason for step in trials.steps)
+
+
+def test_what_has_gone_with_what_a_hand_keeps_may_be_a_part_of_it() -> None:
+    trials, arm = kept_banana()
+    kept = trials.session.kept[arm]
+    gone = replace(kept.sighting.target, T_base_object=se3.make(p=(0.27, -0.16, 0.42)), size=np.full(3, 0.03))
+    trials.session.kept[arm] = replace(kept, adjacent=(gone,))
+    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    assert outcome.code is Code.PLACE_FAILED
+    assert "has gone with it: it is a part of it" in outcome.message
+
+
+def test_what_was_seen_as_two_things_and_rises_as_one_is_placed_as_one(monkeypatch) -> None:
+    """One end of the wrench is taken for another thing, in the observation before the grasp alone."""
+
+    def split(run: Run, frames: Sequence[Frame]) -> Sighting:
+        found = located(run, frames)
+        if run.tried:
+            return found
+        size, long = found.target.size.copy(), int(np.argmax(found.target.size[:2]))
+        end = found.target.T_base_object @ se3.make(p=0.4 * size[long] * np.eye(3)[long])
+        size[long] *= 0.2
+        part = replace(found.target, T_base_object=end, size=size, score=0.5)
+        clouds = []
+        for cloud in found.clouds:
+            away = in_box(cloud.points, part) & (cloud.labels == 1)
+            clouds.append(replace(cloud, labels=np.where(away, 2, cloud.labels).astype(np.uint32)))
+        found = replace(found, others=(part,), clouds=tuple(clouds))
+        run.findings.sighting = found
+        return found
+
+    located = find._locate
+    monkeypatch.setattr(find, "_locate", split)
+    senses = SimulatedSenses(depth_noise=True, detector="anything")
+    trials = Trials(Task("nominal", 1, alone("wrench", 0.27, -0.22, 0.4), ("anything",)), senses, GraspConfig())
+    (grasp,) = trials.run()["grasps"]
+    assert grasp["outcome"] == "placed", grasp["message"]
+    assert grasp["attempts"] == 1, [step.reason for step in trials.steps]

@@ -175,6 +175,21 @@ def test_what_must_stay_is_not_picked_again() -> None:
     assert error.value.code is Code.UNKNOWN_OBJECT
 
 
+def test_a_part_of_what_must_stay_is_not_picked() -> None:
+    handle = seen(x=0.30, y=-0.1, yaw=1.5, size=(0.16, 0.02, 0.03))  # its end is where the middle of the whole is
+    other = seen(x=0.22, y=-0.3, score=0.8)
+    assert look(frames((handle, other)), exclude_near=((0.30, -0.185),)).target.p_base[1] == pytest.approx(-0.3)
+    assert look(frames((handle, other)), exclude_near=((0.33, -0.185),)).target.p_base[1] == pytest.approx(-0.1)
+
+
+def test_what_stands_close_to_what_must_stay_is_picked() -> None:
+    left, close = seen(x=0.20, size=(0.02, 0.02, 0.05)), seen(x=0.235, score=0.8, size=(0.02, 0.02, 0.05))
+    assert look(frames((left, close)), exclude_near=((0.203, -0.2),)).target.p_base[0] == pytest.approx(0.235)
+    assert look(frames((left, close)), exclude_near=((0.232, -0.2),)).target.p_base[0] == pytest.approx(0.2)
+    with pytest.raises(OpenArmError, match="besides 2 that must stay"):
+        look(frames((left, close)), exclude_near=((0.218, -0.2),))  # two parts of one, or not: not picked
+
+
 def test_what_is_not_measured_is_in_the_way_but_no_target() -> None:
     hidden = seen("blue", x=0.28, score=0.0)
     assert [d.label for d in look(frames((seen(), hidden))).others] == ["blue"]

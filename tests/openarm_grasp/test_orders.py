@@ -98,7 +98,7 @@ def test_a_label_that_fails_in_vain_again_and_again_is_given_up():
         asked += 1
         assert asked < 10
         order.done(ask, Code.GRASP_MISSED, "it rolled away", seen=(0.2 + 0.1 * asked, 0.0), touched=True)
-    assert asked == 3
+    assert asked == 6
     assert order.outcome == "FAILED"
 
 

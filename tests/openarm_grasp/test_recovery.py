@@ -15,7 +15,7 @@ from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import Frames, PlanGrasp, PlanPlace
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from tests.openarm_grasp.scripted import GoHome, Grip, MoveLinear, Wait
+from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Wait
 
 
 # --- grasping
@@ -68,8 +68,22 @@ def test_three_misses_end_with_a_named_refusal_open_hand_and_home(world):
     assert outcome.code is Code.GRASP_MISSED
     assert outcome.attempts == 3
     assert world.gap == pytest.approx(0.088)
-    assert isinstance(world.log[-1][1], GoHome)
+    moved = [call for _, call in world.log if isinstance(call, (Follow, GoHome, MoveLinear))]
+    assert isinstance(moved[-1], GoHome)
     assert not world.session.kept
+
+
+def test_where_an_object_is_that_was_moved_in_vain_is_said(world, box):
+    world.slips = 99
+
+    def roll(effect):
+        if world.state is State.RESET and world.attempt == 3:
+            world.objects.update(red=box("red", 0.34, -0.2))
+
+    world.faults.append(roll)
+    outcome = world.grasp()
+    assert outcome.code is Code.GRASP_MISSED
+    assert outcome.object_position[0] == pytest.approx(0.34)
 
 
 def test_a_hand_that_stops_short_has_met_the_object(world):

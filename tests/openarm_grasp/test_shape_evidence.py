@@ -11,11 +11,20 @@ import pytest
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.evidence.shapes import Cluster, ClusterFrame, judge_gone, judge_held, judge_moved, judge_rests
+from openarm_grasp.evidence.shapes import (
+    Cluster,
+    ClusterFrame,
+    judge_gone,
+    judge_held,
+    judge_moved,
+    judge_rests,
+    judge_unmoved,
+)
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
-from openarm_grasp.perception.clouds import came_next_to
-from openarm_grasp.perception.detections import Frame, Sighting
+from openarm_grasp.perception.clouds import came_along, came_next_to
+from openarm_grasp.perception.detections import Frame, Sighting, joined, object_points
 from openarm_grasp.planning.candidates import Box, GraspCandidate
 from openarm_grasp.requests.task import Grasp
 
@@ -187,3 +196,54 @@ def test_what_came_next_to_a_placed_thing_may_be_a_part_of_it():
     part = Detection("anything", 0.9, se3.make(p=(0.3, -0.12, 0.41)), np.array([0.02, 0.08, 0.02]))
     for seen, expected in (((thing,), False), ((thing, stood), False), ((thing, stood, part), True)):
         assert came_next_to(thing, (stood,), [Frame(1, seen), Frame(2, ())], 0.03) is expected
+
+
+OVER = np.array([0.5, 0.0, 1.1])
+HANDLE, HEAD, NEIGHBOUR = slab(0.27, -0.20), slab(0.35, -0.20, half=(0.02, 0.03)), slab(0.27, -0.15, half=(0.05, 0.01))
+
+
+def boxed(points: np.ndarray) -> Detection:
+    low, high = points.min(axis=0), points.max(axis=0)
+    low[2] = 0.40
+    return Detection("anything", 0.9, se3.make(p=0.5 * (low + high)), high - low)
+
+
+def in_two() -> Sighting:
+    """A thing that was seen as two, and a neighbour as near to it as its own part."""
+    points = np.concatenate([HANDLE, HEAD, NEIGHBOUR]).astype(np.float32)
+    labels = np.repeat([1, 2, 2], [len(HANDLE), len(HEAD), len(NEIGHBOUR)]).astype(np.uint32)
+    return Sighting(boxed(HANDLE), (boxed(HEAD), boxed(NEIGHBOUR)), 0, (LabelledCloud(points, labels, OVER),))
+
+
+@pytest.mark.requirement("R-16")
+def test_what_rises_with_a_thing_as_one_body_is_a_part_of_it():
+    found = in_two()
+    T = se3.make(se3.rot_z(0.05), (0.0, 0.0, 0.12))
+    risen = se3.apply(T, np.concatenate([HANDLE, HEAD]))
+
+    def seen(*clusters: np.ndarray) -> list[Frame]:
+        points = np.concatenate(clusters).astype(np.float32)
+        return [Frame(1, tuple(map(boxed, clusters)), LabelledCloud(points, np.ones(len(points), np.uint32), OVER))]
+
+    assert came_along(seen(risen, NEIGHBOUR), found, risen, T) == (found.others[0],)
+    assert came_along(seen(se3.apply(T, HANDLE), HEAD, NEIGHBOUR), found, se3.apply(T, HANDLE), T) == ()
+    assert came_along(seen(risen, HEAD, NEIGHBOUR), found, risen, T) == ()  # its like still lies there
+    assert came_along([Frame(1, ())], found, risen, T) == ()
+    assert came_along(seen(NEIGHBOUR), found, risen[:0], T) == ()
+
+
+def test_a_thing_with_its_part_is_one():
+    found = in_two()
+    whole = joined(found, found.others[:1])
+    every = np.concatenate([HANDLE, HEAD])
+    assert len(object_points(whole.clouds)) == len(every)
+    assert whole.others == found.others[1:]
+    assert whole.target.p_base == pytest.approx(boxed(every).p_base, abs=1e-6)
+    assert whole.target.size == pytest.approx(boxed(every).size, abs=1e-6)
+    assert whole.target.measured
+
+
+def test_a_part_that_was_seen_apart_before_has_not_moved():
+    now = np.concatenate([HANDLE, HEAD])
+    assert judge_unmoved(HANDLE, now, HELD, HEAD) == (True, "the object still stands there")
+    assert not judge_unmoved(HANDLE, now, HELD, NEIGHBOUR)[0]

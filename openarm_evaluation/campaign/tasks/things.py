@@ -13,7 +13,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.objects.model import SUPERQUADRIC, load_object, object_names
 from openarm_common.printable import brief
 from openarm_common.robot.folder import robot_work
-from openarm_common.scene.scene import Scene, parse_scene
+from openarm_common.scene.scene import Scene, SceneObject, parse_scene
 from openarm_evaluation.campaign.tasks.settle import dropped
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.judging.graspable import Graspable, GraspJudge
@@ -28,7 +28,7 @@ _SUPERQUADRICS = "superquadrics:"
 _MOST = 1_000_000
 #: Objects of a heap, and half of the edge of where they are dropped, m.
 _HEAP, _HEAP_HALF = (5, 10), 0.11
-_TRIES = 200
+_TRIES, _DROPS = 200, 20
 
 
 def object_sources(text: str) -> tuple[str, ...]:
@@ -90,12 +90,22 @@ def objects_task(seed: int, objects: str = "") -> Task:
 
 
 def heap_task(seed: int, objects: str = "") -> Task:
-    """Make a task with five to ten objects that were dropped together, all of them requested; as `objects_task`."""
+    """Make a task with five to ten objects that were dropped together, all of them requested; as `objects_task`.
+
+    Where too many have rolled off the table, others are dropped.
+    """
     sources, rng = object_sources(objects), np.random.default_rng([seed, 43])
-    chosen = _drawn(sources, int(rng.integers(_HEAP[0], _HEAP[1] + 1)), rng)
-    work = robot_work()
-    # in the middle, where both arms come: both sides are free for what is cleared
-    items = dropped(chosen, work.table, (0.5 * sum(work.region.x), 0.0), _HEAP_HALF, rng)
+    work, items = robot_work(), list[SceneObject]()
+    for _ in range(_DROPS):
+        chosen = _drawn(sources, int(rng.integers(_HEAP[0], _HEAP[1] + 1)), rng)
+        # in the middle, where both arms come: both sides are free for what is cleared
+        items = dropped(chosen, work.table, (0.5 * sum(work.region.x), 0.0), _HEAP_HALF, rng)
+        if len(items) >= _HEAP[0]:
+            break
+    else:
+        text = f"heap {seed}: fewer than {_HEAP[0]} objects stay on the table in each of {_DROPS} drops"
+        text += "; expected --objects that come to rest where they fall"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
     # what lies in a heap overlaps, seen from above: the scene is one of physics, and not checked as one of a file
     scene = Scene(name=f"heap_{seed}", objects=tuple(items), appearance=seed)
     return _task("heap", seed, scene)
