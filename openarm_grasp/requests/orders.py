@@ -8,7 +8,7 @@ what came of it. Bins are rectangles on the table, base frame, m.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
@@ -30,7 +30,8 @@ _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 #: With these the camera had not shown enough yet: another look may.
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
-#: Requests in vain, one after the other, until a label is given up: that saw nothing, and that moved an arm.
+#: Requests in vain, one after the other, until a label is given up: that saw nothing, or nothing for long; and that
+#: moved an arm.
 _UNSEEN, _IN_VAIN = 3, 6
 #: Pushes in vain, one after the other, until nothing more is pushed.
 _PUSHES = 3
@@ -96,6 +97,7 @@ class Left:
         code: Why it was left.
         why: Why, in a sentence.
         after: Objects that had been placed by then.
+        touched: An arm has moved for it.
     """
 
     label: str
@@ -103,6 +105,7 @@ class Left:
     code: Code
     why: str
     after: int
+    touched: bool = False
 
     def __str__(self) -> str:
         """Sentence for the report."""
@@ -115,9 +118,9 @@ class Order:
     """Objects to be picked one after the other: of those that fit, the easiest first.
 
     What cannot be taken is left until all others have been tried, and asked for again when something has been taken
-    away since: it may have been in the way, or have hidden it. Where no easy one is left, each is asked for by where it
-    is: what stands close to it may be pushed aside then, after which others may have become easy. The order ends when
-    nothing is left, or nothing can be done about what is.
+    away since: it may have been in the way, or have hidden it. So is, once, what an arm has moved: it lies otherwise
+    now. Where no easy one is left, each is asked for by where it is: what stands close to it may be pushed aside then,
+    after which others may have become easy. The order ends when nothing is left, or nothing can be done about what is.
 
     Attributes:
         labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
@@ -136,6 +139,7 @@ class Order:
     failed: dict[str, str] = field(default_factory=dict[str, str])
     _stand: list[Spot] = field(default_factory=list[Spot])
     _ended: dict[str, int] = field(default_factory=dict[str, int])
+    _again: dict[str, int] = field(default_factory=dict[str, int])
     _in_vain: int = 0
     _held: str = ""
     _asked_by_place: list[Spot] = field(default_factory=list[Spot])
@@ -171,8 +175,9 @@ class Order:
                 return GraspRequest(
                     label, object_at=where, exclude_near=tuple(self._stand), place_choices=self._spots(label)
                 )
-            # whatever it was asked for as, what was placed or left is not asked for again
-            left = (one.where for one in self.left if one.where is not None)
+            # whatever it was asked for as, what was placed or left is not asked for again; what was seen for a moment
+            # may be nothing but a part of something else
+            left = (one.where for one in self.left if one.where is not None and one.code not in _GONE)
             return GraspRequest(
                 f"{EASIEST} {label}", exclude_near=(*self._stand, *left), place_choices=self._spots(label)
             )
@@ -184,6 +189,11 @@ class Order:
             return None
         left = (one.where for one in self.left if one.label == label and one.code in NO_WAY)
         return next((where for where in left if where is not None and not self._was_asked_for(where)), None)
+
+    def _at(self, spot: Spot, label: str = "") -> Iterator[Left]:
+        """What was left about there, of a label, or of any."""
+        near = (one for one in self.left if one.where is not None and math.dist(one.where, spot) < _SAME_SPOT)
+        return (one for one in near if label in ("", one.label))
 
     def _was_asked_for(self, where: Spot) -> bool:
         return any(math.dist(where, spot) < _SAME_SPOT for spot in self._asked_by_place)
@@ -225,10 +235,10 @@ class Order:
             return None  # no hand holds anything: it is where it was seen last
         if placing and self.left and code is Code.OK:
             self.left.pop()  # what was left in the hand
-        unseen = seen is None and code in _NOT_SEEN
+        unseen = code in _NOT_SEEN if seen is None else code in _GONE and not touched
         self._in_vain = self._in_vain + 1 if (touched or unseen) and code is not Code.OK else 0
         if request.object_at is not None:
-            self._note_place(label, request.object_at, seen, touched=touched, gone=code in _GONE and seen is None)
+            self._note_place(label, request.object_at, seen, touched=touched, gone=code in _GONE)
         if code is Code.OK:
             self._asked_by_place, self._pushed_in_vain = [], 0
             self.placed.append(label)
@@ -240,7 +250,8 @@ class Order:
             self.failed[label] = f"{code}: {message}"
         else:
             where = None if seen is None else (float(seen[0]), float(seen[1]))
-            self.left.append(Left(label, where, code, message, len(self.placed)))
+            if where is None or code not in _GONE or not any(self._at(where, label)):
+                self.left.append(Left(label, where, code, message, len(self.placed), touched))
             if (where is None and not unseen) or self._in_vain >= (_UNSEEN if unseen else _IN_VAIN):
                 self._ended[label], self._in_vain = len(self.placed), 0
         return next((one for one in self.left if one not in before), None)
@@ -254,7 +265,7 @@ class Order:
         """
         spot = (float(where[0]), float(where[1]))
         self._asked_by_place += [spot, *([] if seen is None else [(float(seen[0]), float(seen[1]))])]
-        here = [one for one in self.left if one.where is not None and math.dist(one.where, spot) < _SAME_SPOT]
+        here = list(self._at(spot))
         again = [one for one in self.left if touched and one.label == label and one not in here]
         self.left = [one for one in self.left if one not in again and (gone or one not in here)]
         if touched:
@@ -262,8 +273,11 @@ class Order:
             self._ended.pop(label, None)
 
     def _none_left(self, label: str, code: Code, message: str) -> None:
-        """Nothing more of a label is in view besides what was left: that is tried again if it may have become free."""
+        """Nothing more of a label is in view besides what was left: that is tried again if anything has changed."""
         again = [one for one in self.left if one.label == label and one.after < len(self.placed)]
+        if not again and self._again.get(label) != len(self.placed):
+            self._again[label] = len(self.placed)
+            again = [one for one in self.left if one.label == label and one.touched]
         self.left = [one for one in self.left if one not in again]
         if not again:
             self._ended[label] = len(self.placed)
