@@ -190,7 +190,7 @@ class PlaceConfig(Config):
 
     release_height: float = Field(default=0.001, ge=0.0, le=0.01, description="above touching the table at release, m")
     tolerance: float = Field(
-        default=0.02, gt=0.0, le=0.1, description="seen this near to the target counts as placed, m"
+        default=0.02, gt=0.0, le=0.1, description="this near to the target counts as placed, m; any shape: 3/4 of it"
     )
     yaw_step_deg: float = Field(default=30.0, gt=0.0, le=180.0, description="turns of the object that are tried, deg")
     region_x: Interval = Field(

@@ -30,8 +30,7 @@ _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 #: With these the camera had not shown enough yet: another look may.
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
-#: Requests in vain, one after the other, until a label is given up: that saw nothing, or nothing for long; and that
-#: moved an arm.
+#: Requests in vain, one after the other, until a label is given up: that saw nothing, and that moved an arm.
 _UNSEEN, _IN_VAIN = 3, 6
 #: Pushes in vain, one after the other, until nothing more is pushed.
 _PUSHES = 3
@@ -175,19 +174,18 @@ class Order:
                 return GraspRequest(
                     label, object_at=where, exclude_near=tuple(self._stand), place_choices=self._spots(label)
                 )
-            # whatever it was asked for as, what was placed or left is not asked for again; what was seen for a moment
-            # may be nothing but a part of something else
-            left = (one.where for one in self.left if one.where is not None and one.code not in _GONE)
+            # whatever it was asked for as, what was placed or left is not asked for again
+            left = (one.where for one in self.left if one.where is not None)
             return GraspRequest(
                 f"{EASIEST} {label}", exclude_near=(*self._stand, *left), place_choices=self._spots(label)
             )
         return None
 
     def _left_in_a_crowd(self, label: str) -> Spot | None:
-        """Where something was left that no hand has room around, and that was not asked for by its place yet."""
+        """Where something was left that no hand has room around, or that was seen once, and was not asked for there."""
         if self._pushed_in_vain >= _PUSHES or len(self._asked_by_place) > 2 * _MOST:
             return None
-        left = (one.where for one in self.left if one.label == label and one.code in NO_WAY)
+        left = (one.where for one in self.left if one.label == label and one.code in (*NO_WAY, *_GONE))
         return next((where for where in left if where is not None and not self._was_asked_for(where)), None)
 
     def _at(self, spot: Spot, label: str = "") -> Iterator[Left]:
@@ -235,7 +233,7 @@ class Order:
             return None  # no hand holds anything: it is where it was seen last
         if placing and self.left and code is Code.OK:
             self.left.pop()  # what was left in the hand
-        unseen = code in _NOT_SEEN if seen is None else code in _GONE and not touched
+        unseen = seen is None and code in _NOT_SEEN
         self._in_vain = self._in_vain + 1 if (touched or unseen) and code is not Code.OK else 0
         if request.object_at is not None:
             self._note_place(label, request.object_at, seen, touched=touched, gone=code in _GONE)
@@ -278,6 +276,8 @@ class Order:
         if not again and self._again.get(label) != len(self.placed):
             self._again[label] = len(self.placed)
             again = [one for one in self.left if one.label == label and one.touched]
+        if again:  # what was seen for a moment may be a part of it
+            again += [one for one in self.left if one.label == label and one.code in _GONE]
         self.left = [one for one in self.left if one not in again]
         if not again:
             self._ended[label] = len(self.placed)

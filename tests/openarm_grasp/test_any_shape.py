@@ -97,6 +97,16 @@ def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_th
     assert any("it had turned or slipped in the hand" in step.reason for step in trials.steps)
 
 
+def test_what_is_seen_away_from_its_target_is_not_said_to_be_placed() -> None:
+    trials, arm = kept_banana()
+    kept = trials.session.kept[arm]
+    shifted = se3.make(p=(0.0, 0.030, 0.0)) @ kept.candidate.T_base_tcp
+    trials.session.kept[arm] = replace(kept, candidate=replace(kept.candidate, T_base_tcp=shifted))
+    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    assert outcome.attempts == 2, outcome.message
+    assert any("mm from its target, expected at most 15 mm" in step.reason for step in trials.steps)
+
+
 def test_what_has_gone_with_what_a_hand_keeps_may_be_a_part_of_it() -> None:
     trials, arm = kept_banana()
     kept = trials.session.kept[arm]
