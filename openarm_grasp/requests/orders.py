@@ -243,7 +243,8 @@ class Order:
             if len(placed) >= 2:
                 self._stand.append((float(placed[0]), float(placed[1])))
         elif code in _GONE and seen is None:
-            self._none_left(label, code, message)
+            if request.object_at is None:  # what is not at its place any more may be elsewhere
+                self._none_left(label, code, message)
         elif code in (*_OVER, Code.INVALID_ARGUMENT):
             self.failed[label] = f"{code}: {message}"
         else:

@@ -292,6 +292,18 @@ def test_what_an_arm_has_moved_in_vain_is_asked_for_once_more():
     assert [one.where for one in order.left] == [(0.31, 0.09)]
 
 
+@pytest.mark.requirement("R-17")
+def test_what_a_push_has_moved_out_of_sight_does_not_end_an_order():
+    order = Order(("anything",))
+    for x in (0.2, 0.3):
+        order.done(order.next(), Code.IN_COLLISION, "no room", seen=(x, 0.1, 0.4))
+    order.done(order.next(), Code.UNKNOWN_OBJECT, "no more")
+    ask = order.next()
+    assert ask.object_at == (0.2, 0.1)
+    order.done(ask, Code.UNKNOWN_OBJECT, "not there after the push", touched=True)
+    assert order.next() == GraspRequest("easiest anything", exclude_near=((0.2, 0.1),))
+
+
 @pytest.mark.requirement("R-17", "P-02")
 def test_what_is_seen_for_a_moment_does_not_keep_for_good_from_what_it_is_a_part_of():
     order = Order(("anything",))
