@@ -48,7 +48,7 @@ from openarm_grasp.strategies.second_look import second_look
 _BLIND = (Code.NOT_READY, Code.STALE_DATA, Code.TIMEOUT)
 #: Frames that must not show the object in its old place after the lift: a detector may miss it in one.
 _LIFT_FRAMES = 2
-#: Share of the tolerance of a place in which the middle of any shape must be seen: it is seen 5 mm off itself (95 %).
+#: Share of the tolerance of a place in which the middle of any shape must be seen: it may be millimetres elsewhere.
 _SEEN_WITHIN = 0.75
 
 
