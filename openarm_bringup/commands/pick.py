@@ -237,6 +237,7 @@ def order(
                 result = client.pick(
                     ask.label,
                     phase=ask.phase,
+                    object_at=ask.object_at,
                     exclude_near=ask.exclude_near,
                     place_choices=ask.place_choices,
                     timeout=timeout,

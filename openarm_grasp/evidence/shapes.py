@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict
-from openarm_grasp.planning.candidates import Box
 
 #: A thing that rests as it rested is as high as before, m, or to this share of its height.
 _HEIGHT, _HEIGHT_SHARE = 0.008, 0.08
@@ -133,21 +133,20 @@ def judge_gone(
     return CameraVerdict(Code.OK, f"the cluster has gone from its place{text}")
 
 
-def judge_held(held: Sequence[Box], points: Array, config: HeldConfig) -> CameraVerdict:
+def judge_held(standing: Array, points: Array, T_now_before: Array, config: HeldConfig) -> CameraVerdict:
     """Whether what hangs in the hand is where it was taken hold of: GRASP_LOST, when it has turned or slipped.
 
+    Moved back to where the hand took hold of it, it is where something was seen, or below that.
+
     Args:
-        held: Boxes about the thing, where the hand should hold it, base frame.
+        standing: (n, 3) voxels of what was seen before, down to the table.
         points: (n, 3) of what is seen of it; none proves nothing.
+        T_now_before: (4, 4) how the hand has moved since it took hold.
         config: Thresholds.
     """
-    if not len(points) or not held:
+    if not len(points) or not len(standing):
         return CameraVerdict(Code.OK, "the hand hides what it holds")
-    out = np.full(len(points), np.inf)
-    for box in held:
-        T = box.T_frame_box
-        beyond = np.maximum(np.abs((points - T[:3, 3]) @ T[:3, :3]) - 0.5 * box.size, 0.0)
-        out = np.minimum(out, np.linalg.norm(beyond, axis=1))
+    out, _ = KDTree(standing).query(se3.apply(se3.inverse(T_now_before), points))
     off, limit = 1e3 * float(np.percentile(out, _MOST)), 1e3 * config.askew
     if off > limit:
         text = f"it reaches {off:.0f} mm out of where the hand should hold it, expected at most {limit:.0f} mm"
@@ -232,7 +231,9 @@ def _upper(points: Array) -> Array:
     return order[first]
 
 
-def judge_rests(before: Cluster, p_expected: Array, frames: Sequence[ClusterFrame], tolerance: float) -> CameraVerdict:
+def judge_rests(
+    before: Cluster, p_expected: Array, frames: Sequence[ClusterFrame], tolerance: float, *, leaned: bool = False
+) -> CameraVerdict:
     """Whether a thing rests at its target as it rested before the grasp.
 
     Args:
@@ -240,6 +241,7 @@ def judge_rests(before: Cluster, p_expected: Array, frames: Sequence[ClusterFram
         p_expected: (2,) or (3,) where its centroid should be, base frame, m; z is not read.
         frames: Taken after the arm has left; the newest that shows it counts.
         tolerance: Largest horizontal distance, m.
+        leaned: It may have lain on something else: it may be lower now, and look longer.
     """
     if not frames:
         return CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
@@ -254,23 +256,24 @@ def judge_rests(before: Cluster, p_expected: Array, frames: Sequence[ClusterFram
         whole = [c for c in near if not c.cut]
         cut = cut or len(whole) < len(near)
         if whole and frame.place_in_view:
-            return _compare(before, min(whole, key=lambda c: _apart(c, p_expected)), p_expected, tolerance)
+            nearest = min(whole, key=lambda c: _apart(c, p_expected))
+            return _compare(before, nearest, p_expected, tolerance, leaned=leaned)
     why = "is cut off by the border, the robot or another thing" if cut else "is not in view"
     return CameraVerdict(Code.PLACE_FAILED, f"the object {why} after the place: nothing shows that it stands there")
 
 
-def _compare(before: Cluster, now: Cluster, p_expected: Array, tolerance: float) -> CameraVerdict:
+def _compare(before: Cluster, now: Cluster, p_expected: Array, tolerance: float, *, leaned: bool) -> CameraVerdict:
     away = _apart(now, p_expected)
     text = f"the cluster is {away * 1e3:.0f} mm from its target"
     if away > tolerance:
         return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
     stood = before.top - _floor(before)
     higher = now.top - before.top
-    if abs(higher) > max(_HEIGHT, _HEIGHT_SHARE * stood):
+    if abs(higher) > max(_HEIGHT, _HEIGHT_SHARE * stood) and not (leaned and higher < 0.0):
         was = f"it is {abs(higher) * 1e3:.0f} mm {'higher' if higher > 0.0 else 'lower'} than it was"
         return CameraVerdict(Code.PLACE_FAILED, f"the object does not rest as it did: {was}", final=True)
     wider = now.extent - before.extent
-    if abs(wider) > max(_EXTENT, _EXTENT_SHARE * before.extent):
+    if abs(wider) > max(_EXTENT, _EXTENT_SHARE * before.extent) and not (leaned and wider > 0.0):
         was = f"seen from above it is {abs(wider) * 1e3:.0f} mm {'longer' if wider > 0.0 else 'shorter'} than it was"
         return CameraVerdict(Code.PLACE_FAILED, f"the object does not rest as it did: {was}", final=True)
     return CameraVerdict(Code.OK, text)

@@ -3,23 +3,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from openarm_common import se3
 from openarm_common.detection import Detection, gap
 from openarm_common.labelled_cloud import LabelledCloud
-from openarm_common.types import Array
+from openarm_common.types import Array, Floats
 from openarm_grasp.evidence.shapes import Cluster, ClusterFrame
 from openarm_grasp.perception.detections import (
-    NEXT_TO,
     SAME_PLACE,
     Frame,
     Sighting,
     apart,
+    divided,
     in_box,
+    joined,
     object_points,
     points_around,
 )
@@ -30,6 +32,10 @@ _IN_VIEW = 0.025
 _STOOD, _STANDS = 0.015, 0.025
 #: What has risen with a thing is seen this near to where it is then, m; a part is seen so by more than this share.
 _PART, _MOST = 0.008, 0.5
+#: Of what was taken for a thing less than this may have stayed: else it has not risen.
+_MOST_LEFT = 0.8
+#: A point is free where a ray as near to its own, rad, ends so far behind it, m.
+_RAY, _BEHIND = 0.010, 0.015
 #: Fewer points are no cluster.
 _LEAST_POINTS = 30
 
@@ -75,7 +81,8 @@ def cluster_frames(frames: Sequence[Frame], place: Array) -> tuple[ClusterFrame,
 def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Array:
     """Return the points (n, 3) of what the newest image shows over the place of a thing, higher than it stood.
 
-    What stood around it, and may be higher, too, is left out.
+    What is seen where something was before is left out: what stood around it may be higher, too, and what was taken for
+    a part of it may have stayed.
 
     Args:
         frames: In the base frame.
@@ -94,18 +101,16 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
             away = float(np.linalg.norm(now.centroid[:2] - before.centroid[:2]))
             if now.top - before.top >= rise and away <= 0.5 * (now.extent + before.extent):
                 found.append(points)
-    points, around = np.concatenate(found), points_around(sighting.clouds[-1:])
-    if not len(points) or not len(around):
-        return points
-    off, _ = KDTree(around).query(points)
+    clouds, points = sighting.clouds[-1:], np.concatenate(found)
+    off, _ = KDTree(np.concatenate([object_points(clouds), points_around(clouds)])).query(points)
     return points[off > _STOOD]
 
 
-def came_along(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_before: Array) -> tuple[Detection, ...]:
-    """Return what lay next to a thing and has risen with it as one body: it is a part of it.
+def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_before: Array) -> Sighting:
+    """Return the thing as what has risen as one body: with what came along, and without what has stayed.
 
     An image does not distinguish things that touch from parts of one thing; a motion does (Katz and Brock,
-    "Manipulating articulated objects with interactive perception", ICRA 2008).
+    "Manipulating articulated objects with interactive perception", ICRA 2008). What the hand hides says nothing.
 
     Args:
         frames: Since the lift, in the base frame.
@@ -113,20 +118,68 @@ def came_along(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_
         risen: (n, 3) of `risen_points`.
         T_now_before: (4, 4) how the hand has moved since it took hold.
     """
+    cloud = next((frame.cloud for frame in reversed(frames) if frame.cloud is not None), None)
+    if cloud is None or len(risen) < _LEAST_POINTS:
+        return sighting
+    now = _Sight(cloud)
+    standing = cloud.points[cloud.labels > 0]
+    standing = standing[now.away(standing, risen) > _PART]
+
+    def rose(points: Array) -> NDArray[np.int8]:
+        return now.says(se3.apply(T_now_before, points), risen)
+
+    def stays(points: Array) -> NDArray[np.int8]:
+        return now.says(points, standing)
+
     around = points_around(sighting.clouds[-1:])
-    clouds = [frame.cloud.points[frame.cloud.labels > 0] for frame in frames[-1:] if frame.cloud is not None]
-    if not len(risen) or not clouds:
-        return ()
-    up, now, found = KDTree(risen), KDTree(clouds[0]), list[Detection]()
-    for one in (one for one in sighting.others if gap(one, sighting.target) < NEXT_TO):
-        points = around[in_box(around, one)]
-        if len(points) < _LEAST_POINTS:
-            continue
-        rose = float(np.mean(up.query(se3.apply(T_now_before, points))[0] < _PART))
-        stays = float(np.mean(now.query(points)[0] < _PART))
-        if rose > _MOST and stays < 1.0 - _MOST:
-            found.append(one)
-    return tuple(found)
+    parts = [one for one in sighting.others if _is_part(around[in_box(around, one)], rose, stays)]
+    whole = joined(sighting, parts) if parts else sighting
+    own = object_points(whole.clouds)
+    left = (rose(own) <= 0) & (stays(own) > 0)
+    return divided(whole, left) if _LEAST_POINTS <= np.count_nonzero(left) < _MOST_LEFT * len(own) else whole
+
+
+def _is_part(
+    points: Array, rose: Callable[[Array], NDArray[np.int8]], stays: Callable[[Array], NDArray[np.int8]]
+) -> bool:
+    """Whether most of the points (n, 3) of something that can be seen have risen, and do not lie where they lay."""
+    if len(points) < _LEAST_POINTS:
+        return False
+    up, down = rose(points), stays(points)
+    seen, there = np.count_nonzero(up), np.count_nonzero(up > 0)
+    return there >= _LEAST_POINTS // 2 and there > _MOST * seen and np.count_nonzero(down > 0) < _MOST * len(points)
+
+
+class _Sight:
+    """What one image says of points in space.
+
+    Args:
+        cloud: Of the image.
+    """
+
+    def __init__(self, cloud: LabelledCloud) -> None:
+        self._camera = cloud.camera
+        away = cloud.points.astype(np.float64) - cloud.camera
+        self._far = np.linalg.norm(away, axis=1)
+        self._rays = KDTree(away / self._far[:, None])
+
+    @staticmethod
+    def away(points: Array | Floats, others: Array | Floats) -> Array:
+        """How far (n,) points (n, 3) are from the nearest of others (m, 3), m."""
+        return np.full(len(points), np.inf) if not len(others) else np.asarray(KDTree(others).query(points)[0])
+
+    def says(self, points: Array, seen: Array | Floats) -> NDArray[np.int8]:
+        """Whether points (n, 3) are seen (1), seen to be free (-1), or hidden (0): (n,).
+
+        Args:
+            points: That are asked about.
+            seen: (m, 3) points of the image that count.
+        """
+        rays = points - self._camera
+        far = np.linalg.norm(rays, axis=1)
+        turn, nearest = self._rays.query(rays / far[:, None])
+        free = (turn < _RAY) & (self._far[nearest] > far + _BEHIND)
+        return np.where(self.away(points, seen) < _PART, 1, np.where(free, -1, 0)).astype(np.int8)
 
 
 def stands(other: Detection, frames: Sequence[Frame]) -> bool:

@@ -115,20 +115,42 @@ def joined(found: Sighting, parts: Sequence[Detection]) -> Sighting:
         part = np.any([in_box(cloud.points, one) for one in parts], axis=0) & (cloud.labels > 1)
         clouds.append(replace(cloud, labels=np.where(part, 1, cloud.labels).astype(np.uint32)))
     whole = (found.target, *parts)
-    R, points = found.target.T_base_object[:3, :3], object_points(clouds)
-    local = points @ R
-    low, high = local.min(axis=0), local.max(axis=0)
-    low[2], high[2] = min(one.bottom for one in whole), max(one.top for one in whole)
-    target = replace(
-        found.target,
-        T_base_object=se3.make(R, R @ (0.5 * (low + high))),
-        size=high - low,
-        kind="",
-        round=False,
-        measured=all(one.measured for one in whole),
-    )
+    target = _about(found.target, object_points(clouds), whole)
     others = tuple(one for one in found.others if all(one is not part for part in parts))
     return replace(found, target=target, others=others, clouds=tuple(clouds))
+
+
+def divided(found: Sighting, left: NDArray[np.bool_]) -> Sighting:
+    """An object without what was taken for a part of it, and is another thing.
+
+    Args:
+        found: The object and what is around it.
+        left: (n,) which of its points, as of `object_points`, are the other's.
+    """
+    clouds: list[LabelledCloud] = []
+    begin = 0
+    for cloud in found.clouds:
+        mine = np.flatnonzero(cloud.labels == 1)
+        labels = cloud.labels.copy()
+        labels[mine[left[begin : begin + len(mine)]]] = 2
+        begin += len(mine)
+        clouds.append(replace(cloud, labels=labels))
+    points, whole = object_points(found.clouds), (found.target,)
+    target, rest = (_about(found.target, part, whole) for part in (points[~left], points[left]))
+    return replace(found, target=target, others=(*found.others, rest), clouds=tuple(clouds))
+
+
+def _about(like: Detection, points: Array, whole: Sequence[Detection]) -> Detection:
+    """A detection of points (n, 3), turned as another one, that stands as deep as what it was seen as."""
+    R = like.T_base_object[:3, :3]
+    local = points @ R
+    low, high = local.min(axis=0), local.max(axis=0)
+    low[2] = min(one.bottom for one in whole)
+    if len(whole) > 1:
+        high[2] = max(one.top for one in whole)
+    T = se3.make(R, R @ (0.5 * (low + high)))
+    measured = all(one.measured for one in whole)
+    return replace(like, T_base_object=T, size=high - low, kind="", round=False, measured=measured)
 
 
 def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Frame, ...]:

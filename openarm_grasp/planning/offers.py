@@ -11,7 +11,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import GraspCandidate
-from openarm_grasp.planning.retries import FailedGrasp
+from openarm_grasp.planning.retries import FailedGrasp, has_met
 from openarm_grasp.sampling.samplers import Sampling, make_sampler
 from openarm_grasp.sampling.surface import fuse
 from openarm_grasp.sampling.views import views_of
@@ -37,7 +37,7 @@ def offers(
     """
     name = context.config.sampler
     sampler, target = _sampler(name), sighting.target
-    spared = bool(target.kind) and name in ("auto", "boxes")  # a surface takes some 50 ms
+    spared = bool(target.kind) and name in ("auto", "boxes") and not has_met(failed)  # a surface takes some 50 ms
     try:
         return sampler.candidates(asked(context, arm, replace(sighting, clouds=()) if spared else sighting, failed))
     except OpenArmError as error:

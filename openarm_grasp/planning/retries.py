@@ -112,11 +112,15 @@ def proposed(
     offered = propose(target, config, hand, shoulder_xy=shoulder_xy, others=others)
     if not failed:
         return offered
-    after_collision = any(one.code is Code.HAND_COLLISION for one in failed)
-    height = _RAISED_AFTER_COLLISION if after_collision else _RAISED
+    height = _RAISED_AFTER_COLLISION if has_met(failed) else _RAISED
     higher = propose(target, config, hand, shoulder_xy=shoulder_xy, others=others, raised=RAISE)
     raised = (replace(one, score=one.score + height, parts={**one.parts, "raised": height}) for one in higher)
     return (*offered, *raised)
+
+
+def has_met(failed: Sequence[FailedGrasp]) -> bool:
+    """Whether a hand has met something beside an object: it may be wider below its top than it looks."""
+    return any(one.code is Code.HAND_COLLISION for one in failed)
 
 
 def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence[FailedGrasp]) -> Ways:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -32,9 +32,7 @@ _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
 #: Requests in vain, one after the other, until a label is given up: that saw nothing, and that moved an arm.
 _UNSEEN, _IN_VAIN = 3, 6
-#: Pushes in vain, one after the other, until nothing more is pushed.
-_PUSHES = 3
-#: Things that are asked for by their places at most, one after the other in vain.
+#: Things that are asked for by their places at most, while nothing moves.
 _MOST = 10
 #: What is left so near to where something was left before is that, m.
 _SAME_SPOT = 0.02
@@ -95,8 +93,7 @@ class Left:
         where: Where it was seen, base frame, m; None: that is not known.
         code: Why it was left.
         why: Why, in a sentence.
-        after: Objects that had been placed by then.
-        touched: An arm has moved for it.
+        after: Requests that had moved something when it was asked for.
     """
 
     label: str
@@ -104,7 +101,6 @@ class Left:
     code: Code
     why: str
     after: int
-    touched: bool = False
 
     def __str__(self) -> str:
         """Sentence for the report."""
@@ -114,12 +110,13 @@ class Left:
 
 @dataclass
 class Order:
-    """Objects to be picked one after the other: of those that fit, the easiest first.
+    """Objects to be picked one after the other, in rounds: of those that fit, the easiest first.
 
-    What cannot be taken is left until all others have been tried, and asked for again when something has been taken
-    away since: it may have been in the way, or have hidden it. So is, once, what an arm has moved: it lies otherwise
-    now. Where no easy one is left, each is asked for by where it is: what stands close to it may be pushed aside then,
-    after which others may have become easy. The order ends when nothing is left, or nothing can be done about what is.
+    In a round everything in view is asked for once. What cannot be taken is left, and asked for in another round when
+    an arm has moved anything since: it may have been in the way, or have hidden it, or lie otherwise itself. After a
+    round in which nothing has moved, each thing is asked for by where it is: what stands close to it may be pushed
+    aside then. The order ends when nothing is left, when nothing moves any more, or when all that moves does so in
+    vain.
 
     Attributes:
         labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
@@ -136,13 +133,18 @@ class Order:
     placed: list[str] = field(default_factory=list[str])
     left: list[Left] = field(default_factory=list[Left])
     failed: dict[str, str] = field(default_factory=dict[str, str])
+    #: Where what was placed stands, and what a hand may hold.
     _stand: list[Spot] = field(default_factory=list[Spot])
-    _ended: dict[str, int] = field(default_factory=dict[str, int])
-    _again: dict[str, int] = field(default_factory=dict[str, int])
-    _in_vain: int = 0
     _held: str = ""
-    _asked_by_place: list[Spot] = field(default_factory=list[Spot])
-    _pushed_in_vain: int = 0
+    #: Labels of which nothing more is in view in this round, and what the round before had left.
+    _asked: set[str] = field(default_factory=set[str])
+    _before: list[Left] = field(default_factory=list[Left])
+    #: Places that things were asked for by in this round.
+    _by_place: list[Spot] = field(default_factory=list[Spot])
+    #: Requests that have moved something; of the newest, how many in vain, and how many that saw nothing.
+    _moved: int = 0
+    _in_vain: int = 0
+    _unseen: int = 0
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -163,30 +165,28 @@ class Order:
             return None
         if self._held:
             return GraspRequest(f"{EASIEST} {self._held}", phase="place", place_choices=self._spots(self._held))
-        for label in dict.fromkeys(self.labels):
-            most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
-            if label in self.failed or (most and self.placed.count(label) >= most):
-                continue
-            if self._ended.get(label) == len(self.placed):  # nothing has been taken away since
-                where = self._left_in_a_crowd(label)
-                if where is None:
-                    continue
-                return GraspRequest(
-                    label, object_at=where, exclude_near=tuple(self._stand), place_choices=self._spots(label)
-                )
-            # whatever it was asked for as, what was placed or left is not asked for again
-            left = (one.where for one in self.left if one.where is not None)
-            return GraspRequest(
-                f"{EASIEST} {label}", exclude_near=(*self._stand, *left), place_choices=self._spots(label)
-            )
+        wanted = [label for label in dict.fromkeys(self.labels) if label not in self.failed and not self._enough(label)]
+        for label in wanted:
+            if label not in self._asked:
+                # whatever it was asked for as, what was placed or left is not asked for again
+                left = (one.where for one in self.left if one.where is not None)
+                stay = (*self._stand, *left)
+                return GraspRequest(f"{EASIEST} {label}", exclude_near=stay, place_choices=self._spots(label))
+        left = [one for one in self.left if one.label in wanted]
+        if self._in_vain >= _IN_VAIN or not left:
+            return None
+        if any(one.after < self._moved for one in left):
+            self._before, self.left, self._asked, self._by_place = self.left, [], set(), []
+            return self.next()
+        for one in left:
+            if one.where is not None and one.code in (*NO_WAY, *_GONE) and not self._was_asked_for(one.where):
+                stay, spots = tuple(self._stand), self._spots(one.label)
+                return GraspRequest(one.label, object_at=one.where, exclude_near=stay, place_choices=spots)
         return None
 
-    def _left_in_a_crowd(self, label: str) -> Spot | None:
-        """Where something was left that no hand has room around, or that was seen once, and was not asked for there."""
-        if self._pushed_in_vain >= _PUSHES or len(self._asked_by_place) > 2 * _MOST:
-            return None
-        left = (one.where for one in self.left if one.label == label and one.code in (*NO_WAY, *_GONE))
-        return next((where for where in left if where is not None and not self._was_asked_for(where)), None)
+    def _enough(self, label: str) -> bool:
+        most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
+        return 0 < most <= self.placed.count(label)
 
     def _at(self, spot: Spot, label: str = "") -> Iterator[Left]:
         """What was left about there, of a label, or of any."""
@@ -194,7 +194,7 @@ class Order:
         return (one for one in near if label in ("", one.label))
 
     def _was_asked_for(self, where: Spot) -> bool:
-        return any(math.dist(where, spot) < _SAME_SPOT for spot in self._asked_by_place)
+        return len(self._by_place) > 2 * _MOST or any(math.dist(where, spot) < _SAME_SPOT for spot in self._by_place)
 
     def _spots(self, label: str) -> tuple[Spot, ...]:
         return () if self.bins is None else self.bins.bins[self.bins.of(label)].slots(self.bins.spacing)
@@ -226,64 +226,59 @@ class Order:
             touched: An arm has moved for it.
             held: A hand may hold it still: it is put down before anything else.
         """
-        label, before = self.label_of(request), tuple(self.left)
+        label, after = self.label_of(request), self._moved
         self.left = [one for one in self.left if one.label != label or one.where is not None]
         placing, self._held = request.phase == "place", label if held else ""
         if placing and code is Code.NOT_READY:
             return None  # no hand holds anything: it is where it was seen last
-        if placing and self.left and code is Code.OK:
-            self.left.pop()  # what was left in the hand
-        unseen = seen is None and code in _NOT_SEEN
-        self._in_vain = self._in_vain + 1 if (touched or unseen) and code is not Code.OK else 0
-        if request.object_at is not None:
-            self._note_place(label, request.object_at, seen, touched=touched, gone=code in _GONE)
+        self._moved += touched or code is Code.OK
         if code is Code.OK:
-            self._asked_by_place, self._pushed_in_vain = [], 0
-            self.placed.append(label)
-            if len(placed) >= 2:
-                self._stand.append((float(placed[0]), float(placed[1])))
-        elif code in _GONE and seen is None:
-            if request.object_at is None:  # what is not at its place any more may be elsewhere
-                self._none_left(label, code, message)
-        elif code in (*_OVER, Code.INVALID_ARGUMENT):
+            self._place(label, placed, placing=placing)
+            return None
+        if placing or code in (*_OVER, Code.INVALID_ARGUMENT):
             self.failed[label] = f"{code}: {message}"
-        else:
-            where = None if seen is None else (float(seen[0]), float(seen[1]))
-            if where is None or code not in _GONE or not any(self._at(where, label)):
-                self.left.append(Left(label, where, code, message, len(self.placed), touched))
-            if (where is None and not unseen) or self._in_vain >= (_UNSEEN if unseen else _IN_VAIN):
-                self._ended[label], self._in_vain = len(self.placed), 0
-        return next((one for one in self.left if one not in before), None)
+            return None
+        self._in_vain += touched
+        where = None if seen is None else (float(seen[0]), float(seen[1]))
+        if request.object_at is not None:
+            spot = (float(request.object_at[0]), float(request.object_at[1]))
+            self._by_place += [spot, *([] if where is None else [where])]
+            if code not in _GONE:  # what is not seen there any more stays on the list of what was left
+                self.left = [one for one in self.left if one not in tuple(self._at(spot))]
+        if where is None and code in _GONE:
+            return None if request.object_at is not None else self._none_left(label, code, message)
+        self._unseen = self._unseen + 1 if where is None and code in _NOT_SEEN else 0
+        if self._in_vain >= _IN_VAIN or self._unseen >= _UNSEEN or (where is None and not self._unseen):
+            self._asked.add(label)
+        if code in _GONE and where is not None and any(self._at(where, label)):
+            return None
+        return self._leave(Left(label, where, code, message, after))
 
-    def _note_place(
-        self, label: str, where: Sequence[float], seen: Sequence[float] | None, *, touched: bool, gone: bool
-    ) -> None:
-        """Note that what was left somewhere was asked for by its place; what moved may have freed something.
+    def _place(self, label: str, placed: Sequence[float], *, placing: bool) -> None:
+        """Note that an object of a label was placed."""
+        if placing and self.left:
+            self.left.pop()  # what was left in the hand
+        self._in_vain, self._unseen, self._before = 0, 0, []
+        self.placed.append(label)
+        if len(placed) >= 2:
+            self._stand.append((float(placed[0]), float(placed[1])))
+        if self._enough(label):
+            self.left = [one for one in self.left if one.label != label]
 
-        What is not seen there any more stays on the list of what was left.
-        """
-        spot = (float(where[0]), float(where[1]))
-        self._asked_by_place += [spot, *([] if seen is None else [(float(seen[0]), float(seen[1]))])]
-        here = list(self._at(spot))
-        again = [one for one in self.left if touched and one.label == label and one not in here]
-        self.left = [one for one in self.left if one not in again and (gone or one not in here)]
-        if touched:
-            self._pushed_in_vain += 1
-            self._ended.pop(label, None)
+    def _none_left(self, label: str, code: Code, message: str) -> Left | None:
+        """Nothing more of a label is in view besides what was left; what was left before and is out of view is, too."""
+        self._asked.add(label)
+        if any(one.label == label for one in self.left):
+            return None
+        gone = (one for one in self._before if one.label == label and one.where is not None)
+        self.left += [replace(one, after=self._moved) for one in gone]
+        if label in self.placed or any(one.label == label for one in self.left):
+            return None
+        return self._leave(Left(label, None, code, message, self._moved))
 
-    def _none_left(self, label: str, code: Code, message: str) -> None:
-        """Nothing more of a label is in view besides what was left: that is tried again if anything has changed."""
-        again = [one for one in self.left if one.label == label and one.after < len(self.placed)]
-        if not again and self._again.get(label) != len(self.placed):
-            self._again[label] = len(self.placed)
-            again = [one for one in self.left if one.label == label and one.touched]
-        if again:  # what was seen for a moment may be a part of it
-            again += [one for one in self.left if one.label == label and one.code in _GONE]
-        self.left = [one for one in self.left if one not in again]
-        if not again:
-            self._ended[label] = len(self.placed)
-            if label not in self.placed and all(one.label != label for one in self.left):
-                self.left.append(Left(label, None, code, message, len(self.placed)))
+    def _leave(self, one: Left) -> Left:
+        self.left.append(one)
+        return one
 
     @property
     def over(self) -> bool:

@@ -22,6 +22,7 @@ from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
 from openarm_grasp.evidence.verdicts import Evidence
 from openarm_grasp.perception.detections import Sighting, in_base
 from openarm_grasp.planning.candidates import (
+    UP,
     Box,
     GraspCandidate,
     PlaceTarget,
@@ -30,6 +31,7 @@ from openarm_grasp.planning.candidates import (
     target_boxes,
 )
 from openarm_grasp.planning.neighbours import neighbours
+from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
 #: The map shows an object so much wider than it is, m.
@@ -325,7 +327,25 @@ class Skills:
                 except OpenArmError as error:
                     reraise_stop(error)
                     robot.warn(error.message)  # the free path home may still be there
-            await robot.move(arm, config.home_state, f"{arm} arm: go {config.home_state}", obstacles)
+            await self._home(arm, obstacles)
+
+    async def _home(self, arm: str, obstacles: Sequence[Box]) -> None:
+        """Move an arm to its home posture; where there is no way, because something leans on the hand, rise first."""
+        what = f"{arm} arm: go {self._config.home_state}"
+        try:
+            await self.robot.move(arm, self._config.home_state, what, obstacles)
+            return
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            try:
+                await self.move_linear(
+                    arm, se3.make(p=self._config.approach.lift_height * UP) @ self.T_base_tcp(arm), "rise"
+                )
+            except OpenArmError as other:
+                reraise_stop(other)
+                raise error from other
+        await self.robot.move(arm, self._config.home_state, what, obstacles)
 
     def joints(self) -> dict[str, float]:
         """Positions of the joints of all arms, rad by name."""

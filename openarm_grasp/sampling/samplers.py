@@ -22,7 +22,7 @@ from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate
-from openarm_grasp.planning.retries import FailedGrasp, centre_of_mass, proposed
+from openarm_grasp.planning.retries import FailedGrasp, centre_of_mass, has_met, proposed
 from openarm_grasp.sampling.antipodal import Antipodal, Search
 from openarm_grasp.sampling.hand_shape import HandShape
 from openarm_grasp.sampling.slabs import slabs
@@ -114,13 +114,16 @@ class Cloud:
 
 
 class Auto:
-    """Across the faces of what was measured as a box or a cylinder that fits into the hand; else on its cloud."""
+    """Across the faces of what was measured as a box or a cylinder that fits into the hand; else on its cloud.
+
+    So is what a hand has met beside its faces: it is wider below its top.
+    """
 
     def candidates(self, asked: Sampling) -> tuple[GraspCandidate, ...]:
         """As of `GraspSampler`."""
         if asked.surface is None:
             return Boxes().candidates(asked)
-        if asked.target.kind:  # the shape of a prism that fits its outline
+        if asked.target.kind and not has_met(asked.failed):  # the shape of a prism that fits its outline
             try:
                 return Boxes().candidates(asked)
             except OpenArmError as error:

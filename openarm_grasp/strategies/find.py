@@ -8,9 +8,12 @@ from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from openarm_common.detection import Detection, gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.hand import HandParts
+from openarm_common.types import Array
 from openarm_common.wanted import describe
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import (
@@ -18,11 +21,9 @@ from openarm_grasp.perception.detections import (
     Frame,
     Sighting,
     UntrustedError,
-    in_box,
     in_view,
-    joined,
+    object_points,
     on_table,
-    points_around,
 )
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.arms import out_of_reach
@@ -143,8 +144,11 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
     """
     request, limits, top_z, kept = run.request, run.config.detect, run.context.table.top_z, run.kept
     if kept is not None:
-        newest = frames[-1]
-        others = (d for d in newest.detections if d.label != kept.sighting.target.label)
+        newest, target = frames[-1], kept.sighting.target
+        hand = run.robot.T_base_tcp(kept.arm)[:2, 3]
+        reach = float(np.linalg.norm(target.size[:2]))
+        # what hangs in the hand may be seen there
+        others = (d for d in newest.detections if d.label != target.label or _from(d, hand) > reach)
         sighting = replace(kept.sighting, others=_standing(others, top_z), t_ns=newest.t_ns)
     else:
         try:
@@ -163,6 +167,10 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
     if kept or run.size is None or any(d.label == sighting.target.label for d in sighting.others):
         run.size = sighting.target.size
     return sighting
+
+
+def _from(d: Detection, xy: Array) -> float:
+    return float(np.linalg.norm(d.p_base[:2] - xy))
 
 
 def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ...]:
@@ -307,18 +315,14 @@ def grasp_of(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) 
     return Grasp(arm, sighting, candidate, places, adjacent=adjacent)
 
 
-def with_parts(run: Run, grasp: Grasp, parts: Sequence[Detection]) -> Grasp:
-    """A grasp of an object together with what was taken for other objects, and is a part of it."""
-    around, candidate = points_around(grasp.sighting.clouds), grasp.candidate
+def regrasped(run: Run, grasp: Grasp, sighting: Sighting) -> Grasp:
+    """A grasp of an object of which other points turned out to be its own."""
+    candidate, label, gap = grasp.candidate, sighting.target.label, run.config.approach.table_gap
     if candidate.held:
-        table_gap = run.config.approach.table_gap
-        more = [
-            standing_boxes(f"{run.label}/part{n}", around[in_box(around, one)], one.bottom, table_gap)
-            for n, one in enumerate(parts)
-        ]
-        candidate = replace(candidate, held=sum(more, candidate.held))
-    run.findings.sighting, run.place_plan = joined(grasp.sighting, parts), None
-    return replace(grasp_of(run, grasp.arm, run.findings.sighting, candidate), closed=grasp.closed)
+        held = standing_boxes(label, object_points(sighting.clouds[-1:]), sighting.target.bottom, gap)
+        candidate = replace(candidate, held=held)
+    run.findings.sighting, run.place_plan = sighting, None
+    return replace(grasp_of(run, grasp.arm, sighting, candidate), closed=grasp.closed)
 
 
 async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> tuple[Planned, PlaceTarget]:

@@ -17,29 +17,31 @@ from dataclasses import replace
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.shapes import heavier_end, judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.perception.clouds import (
-    came_along,
     came_next_to,
     cluster_frames,
     cluster_of,
+    lifted,
     nearest_to,
     risen_points,
     stands,
 )
 from openarm_grasp.perception.detections import NEXT_TO, Frame, apart, object_points, points_around
-from openarm_grasp.planning.candidates import PlaceTarget, held_boxes
+from openarm_grasp.planning.candidates import PlaceTarget
+from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.planning.place import place_targets, placing_error
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.requests.states import Hand, State, check_transition
 from openarm_grasp.requests.task import Grasp, Placed, Status, Task
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
-from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place, with_parts
+from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place, regrasped
 from openarm_grasp.strategies.retreat import retreat, still_held
 from openarm_grasp.strategies.run import Run
 from openarm_grasp.strategies.second_look import second_look
@@ -50,6 +52,10 @@ _BLIND = (Code.NOT_READY, Code.STALE_DATA, Code.TIMEOUT)
 _LIFT_FRAMES = 2
 #: Share of the tolerance of a place in which the middle of any shape must be seen: it may be millimetres elsewhere.
 _SEEN_WITHIN = 0.75
+
+
+#: What meets something on its way down to its place is let go this high above it, m; what has turned, anywhere.
+_MET_AT = 0.03
 
 
 class ObjectKeptError(OpenArmError):
@@ -300,18 +306,18 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
     frames = (await robot.observe(_LIFT_FRAMES)).frames
     gripper = grasp.judge(evidence, config.held, was_held=True)
     if grasp.of_cloud:
-        place, before, radius = sighting.target.p_base, cluster_of(sighting), config.detect.match_radius
-        camera = judge_gone(before, cluster_frames(frames, place), config.held, match_radius=radius)
+        T, points = robot.T_base_tcp(arm), risen_points(frames, sighting, config.held.rise)
+        moved = T @ se3.inverse(grasp.candidate.T_base_tcp)
+        thing = lifted(frames, sighting, points, moved)
+        if thing is not sighting:
+            grasp = run.grasp = regrasped(run, grasp, thing)
+        place, radius = thing.target.p_base, config.detect.match_radius
+        camera = judge_gone(cluster_of(thing), cluster_frames(frames, place), config.held, match_radius=radius)
         if camera.ok:
-            T, points = robot.T_base_tcp(arm), risen_points(frames, sighting, config.held.rise)
-            moved = T @ se3.inverse(grasp.candidate.T_base_tcp)
-            if parts := came_along(frames, sighting, points, moved):
-                grasp = run.grasp = with_parts(run, grasp, parts)
-            boxes = held_boxes(grasp.sighting.target, grasp.candidate, config)
-            held = [replace(box, T_frame_box=T @ box.T_frame_box) for box in boxes]
-            where = judge_held(held, points, config.held)
+            before = np.concatenate([object_points(sighting.clouds), points_around(sighting.clouds)])
+            where = judge_held(columns(before, run.context.table.top_z), points, moved, config.held)
             if not where.ok:
-                heavy = heavier_end(object_points(sighting.clouds), points, T)
+                heavy = heavier_end(object_points(thing.clouds), points, T)
                 run.grasp, camera = replace(grasp, turned=True, heavy=heavy), where
     else:
         camera = verdicts.judge_sight(
@@ -373,7 +379,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
         if not gripper.ok:
             raise OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}")
         run.enter(State.PLACE, gripper.reason)
-        await robot.follow(arm, plan.approach, "put down", carrying=True)
+        await _lower(run, grasp, plan, target)
         await robot.open(arm, "release", grasp.candidate.opened)
     except OpenArmError as error:
         if error.code is Code.GRASP_LOST:
@@ -394,6 +400,21 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
     else:
         run.hand = Hand.CLEAR
     return Placed(target, gripper, reason)
+
+
+async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget) -> None:
+    """Go down to the place; what meets something a little above it is let go there.
+
+    Raises:
+        OpenArmError: EXECUTION_FAILED, when it meets something higher up.
+    """
+    try:
+        await run.robot.follow(grasp.arm, plan.approach, "put down", carrying=True)
+    except OpenArmError as error:
+        above = float((run.robot.T_base_tcp(grasp.arm) - target.T_base_tcp)[2, 3])
+        if error.code is not Code.EXECUTION_FAILED or (above > _MET_AT and not grasp.turned):
+            raise
+        run.robot.warn(f"{error.message}: what the hand holds meets something below, and is let go there")
 
 
 # --- verify
@@ -442,7 +463,9 @@ def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame
     if before.cut:
         seen = judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
     else:
-        seen = judge_rests(before, rests, cluster_frames(frames, rests), _SEEN_WITHIN * config.place.tolerance)
+        leaned = any(gap(d, grasp.sighting.target) < NEXT_TO for d in grasp.sighting.others)
+        tolerance = _SEEN_WITHIN * config.place.tolerance
+        seen = judge_rests(before, rests, cluster_frames(frames, rests), tolerance, leaned=leaned)
     torn = next((d for d in grasp.adjacent if not before.cut and not stands(d, frames)), None)
     if seen.ok and torn is not None:
         x, y = torn.p_base[:2]

@@ -92,9 +92,9 @@ async def _put_back(run: Run, grasp: Grasp) -> None:
             for part in (plan.transfer, plan.approach):
                 await robot.follow(arm, part, "put back")
     except OpenArmError as error:
-        if not slipped or error.code is not Code.EXECUTION_FAILED:
+        if error.code is not Code.EXECUTION_FAILED:
             raise
-        robot.warn(f"{error.message}: what has turned in the hand meets something below, and is let go there")
+        robot.warn(f"{error.message}: what the hand holds meets something below, and is let go there")
 
 
 def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidates.Box, ...]:

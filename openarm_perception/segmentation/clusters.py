@@ -116,7 +116,7 @@ def segment(
     image = _Image(points, divided.even, intrinsics, support, T, robot, rgb)
     label, found = divided.label, image.clusters(divided.label)
     if config.join_parts:
-        root = joined(found)
+        root = joined(found, divided.pieces)
         _, number = np.unique(root, return_inverse=True)
         if len(found) and number.max() + 1 < len(found):
             label = np.concatenate([[0], number + 1]).astype(np.uint16)[label]

@@ -17,7 +17,7 @@ from openarm_common.config import Config
 from openarm_common.types import Array, Bytes, Mask
 from openarm_perception.geometry.depth import Points
 from openarm_perception.geometry.patch import denoise
-from openarm_perception.segmentation.colors import join_alike
+from openarm_perception.segmentation.colors import join_alike, join_smooth
 from openarm_perception.segmentation.grouping import partition
 from openarm_perception.segmentation.kernels import (
     SLANT,
@@ -63,7 +63,7 @@ class SegmentationConfig(Config):
     least_size: float = Field(
         default=0.012, gt=0.0, le=0.2, description="pieces that are smaller (root of the area) are no things, m"
     )
-    join_colors: bool = Field(default=True, description="parts that touch and have the same plain colour are one thing")
+    join_colors: bool = Field(default=True, description="parts that touch and have the same colour are one thing")
     least_pixels: int = Field(default=60, ge=12, description="nor are pieces of fewer pixels")
     join_parts: bool = Field(
         default=False, description="pieces that touch are one thing, unless both are boxes or cylinders"
@@ -79,12 +79,14 @@ class Divided:
         patch: (h, w) int32, the patches of surface that they are made of.
         even: (h, w, 3) points without the noise of single pixels, optical frame, m.
         heights: (h, w) float32 of those over the support, m.
+        pieces: Of how many pieces each thing is, which its colours alone have joined.
     """
 
     label: NDArray[np.uint16]
     patch: Labels
     even: Points
     heights: NDArray[np.float32]
+    pieces: tuple[int, ...]
 
 
 def divide(
@@ -132,8 +134,12 @@ def divide(
     root = _join_small(root, patch, area, moments[:, 0], border, size, config)
     if rgb is not None and config.join_colors:
         root = join_alike(root, patch, border, rgb)
-    number = _number(root, patch, area, moments, support, intrinsics, config)
-    return Divided(_filled(number[patch], raised), patch, even, heights)
+    piece = number = _number(root, patch, area, moments, support, intrinsics, config)
+    if rgb is not None and config.join_colors:
+        root = join_smooth(root, patch, border, rgb)
+        number = _number(root, patch, area, moments, support, intrinsics, config)
+    pieces = tuple(len(np.unique(piece[(number == i) & (piece > 0)])) for i in range(1, int(number.max()) + 1))
+    return Divided(_filled(number[patch], raised), patch, even, heights, pieces)
 
 
 def _filled(label: NDArray[np.uint16], raised: Mask) -> NDArray[np.uint16]:

@@ -31,13 +31,16 @@ _OVER, _ASKED = 0.3, 200
 _PARTS = 3
 #: What is joined is no larger than this, m: things that a hand grasps are long or wide, not both.
 _LONG, _WIDE = 0.38, 0.20
+#: And has one body: of its parts no two are wider than this, m.
+_BODY = 0.065
 
 
-def joined(clusters: Sequence[Cluster]) -> Ints:
+def joined(clusters: Sequence[Cluster], pieces: Sequence[int] = ()) -> Ints:
     """Return the group (n,) of each cluster: the index of its first one.
 
     Args:
         clusters: Of one image.
+        pieces: Of how many pieces each is already; none: of one.
     """
     root = np.arange(len(clusters))
     clouds = [one.points.astype(np.float64) for one in clusters]
@@ -47,23 +50,24 @@ def joined(clusters: Sequence[Cluster]) -> Ints:
         for j, b in enumerate(clusters[:i])
         if (gap := _gap(clouds[i], clouds[j])) <= (_TOUCH if "unknown" in (a.shape.kind, b.shape.kind) else _BOXES)
     ]
-    heap = _heaps(len(clusters), [(i, j) for _, i, j in pairs])
+    body = [_extent(cloud)[1] > _BODY for cloud in clouds]
+    heap = _heaps(pieces or (1,) * len(clusters), [(i, j) for _, i, j in pairs])
     for _, i, j in sorted(pairs):
         if heap[i]:
             continue
         one, other = root[i], root[j]
         both = np.flatnonzero((root == one) | (root == other))
-        if one != other and _fits(np.concatenate([clouds[k] for k in both])):
+        if one != other and sum(body[k] for k in both) < 2 and _fits(np.concatenate([clouds[k] for k in both])):
             root[both] = min(one, other)
     return root
 
 
-def _heaps(count: int, touching: Sequence[tuple[int, int]]) -> NDArray[np.bool_]:
-    """Return which of the pieces (count,) hang together with more than a thing has parts."""
-    ends = np.array(touching, np.int64).reshape(-1, 2)
+def _heaps(pieces: Sequence[int], touching: Sequence[tuple[int, int]]) -> NDArray[np.bool_]:
+    """Return which of the clusters (n,) hang together with more pieces than a thing has parts."""
+    ends, count = np.array(touching, np.int64).reshape(-1, 2), len(pieces)
     graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
     _, label = connected_components(graph, directed=False)
-    return np.bincount(label, minlength=1)[label] > _PARTS
+    return np.bincount(label, weights=pieces, minlength=1)[label] > _PARTS
 
 
 def _gap(a: Array, b: Array) -> float:
@@ -85,5 +89,11 @@ def _gap(a: Array, b: Array) -> float:
 
 def _fits(points: Array) -> bool:
     """Return whether points (n, 3) may be those of one thing, by their extent seen from above."""
-    _, (width, length), _ = cv2.minAreaRect((points[:, :2] * 1e3).astype(np.float32))
-    return max(width, length) <= 1e3 * _LONG and min(width, length) <= 1e3 * _WIDE
+    length, width = _extent(points)
+    return length <= _LONG and width <= _WIDE
+
+
+def _extent(points: Array) -> tuple[float, float]:
+    """Return length and width of points (n, 3) seen from above, m."""
+    _, size, _ = cv2.minAreaRect((points[:, :2] * 1e3).astype(np.float32))
+    return 1e-3 * max(size), 1e-3 * min(size)

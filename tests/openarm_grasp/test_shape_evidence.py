@@ -23,9 +23,10 @@ from openarm_grasp.evidence.shapes import (
     judge_unmoved,
 )
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
-from openarm_grasp.perception.clouds import came_along, came_next_to
+from openarm_grasp.perception.clouds import came_next_to, lifted, risen_points
 from openarm_grasp.perception.detections import Frame, Sighting, joined, object_points
-from openarm_grasp.planning.candidates import Box, GraspCandidate
+from openarm_grasp.planning.candidates import GraspCandidate
+from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.requests.task import Grasp
 
 HELD = HeldConfig()
@@ -124,6 +125,16 @@ def test_what_was_cut_off_when_it_was_first_seen_is_never_said_to_be_placed():
     assert verdict.code is Code.PLACE_FAILED
 
 
+@pytest.mark.requirement("R-16")
+def test_what_lay_on_something_else_may_rest_lower_and_longer():
+    p = np.array([0.30, 0.1])
+    lower, higher, short = at(0.30, 0.1, top=0.425, extent=0.16), at(0.30, 0.1, top=0.455), at(0.30, 0.1, extent=0.08)
+    assert not judge_rests(STOOD, p, [frame(lower)], 0.02).ok
+    assert judge_rests(STOOD, p, [frame(lower)], 0.02, leaned=True).ok
+    assert not judge_rests(STOOD, p, [frame(higher)], 0.02, leaned=True).ok
+    assert not judge_rests(STOOD, p, [frame(short)], 0.02, leaned=True).ok
+
+
 def test_a_cluster_is_measured_without_its_few_flying_points():
     rng = np.random.default_rng(3)
     points = np.column_stack(
@@ -160,11 +171,21 @@ def test_a_grasp_judges_its_hand_by_its_interval_and_by_how_far_it_had_closed():
 @pytest.mark.requirement("R-16")
 @pytest.mark.parametrize(("turn", "code"), [(0.0, Code.OK), (0.1, Code.OK), (0.5, Code.GRASP_LOST)])
 def test_a_long_thing_that_turns_about_the_fingers_is_lost(turn, code):
-    along = np.linspace(0.0, 0.2, 81)
-    points = np.stack([along * np.cos(turn), np.zeros(81), -along * np.sin(turn)], axis=1)
-    held = (Box("target/long", se3.make(p=(0.1, 0.0, 0.0)), np.array([0.2, 0.03, 0.02])),)
-    assert judge_held(held, points, HELD).code is code
-    assert judge_held(held, points[:0], HELD).ok  # what the hand hides proves nothing
+    lies = slab(0.27, -0.2, half=(0.1, 0.015), top=0.42)
+    T = se3.make(se3.rot_z(0.4), (0.05, 0.1, 0.12))
+    end = np.array([0.17, -0.2, 0.42])
+    points = se3.apply(T @ se3.make(se3.rot_y(turn), end) @ se3.make(p=-end), lies)
+    standing = columns(lies, 0.40)
+    assert judge_held(standing, points, T, HELD).code is code
+    assert judge_held(standing, points[:0], T, HELD).ok  # what the hand hides proves nothing
+
+
+@pytest.mark.requirement("R-16")
+def test_what_hangs_in_the_hand_may_have_been_hidden_below_what_was_seen():
+    lies = slab(0.27, -0.2, top=0.46)
+    T = se3.make(p=(0.0, 0.0, 0.12))
+    assert judge_held(columns(lies, 0.40), se3.apply(T, lies - (0.0, 0.0, 0.03)), T, HELD).ok
+    assert not judge_held(columns(lies, 0.40), se3.apply(T, lies - (0.0, 0.0, 0.09)), T, HELD).ok
 
 
 def slab(x, y, half=(0.05, 0.02), top=0.44, n=1500):
@@ -215,21 +236,66 @@ def in_two() -> Sighting:
     return Sighting(boxed(HANDLE), (boxed(HEAD), boxed(NEIGHBOUR)), 0, (LabelledCloud(points, labels, OVER),))
 
 
+def table() -> np.ndarray:
+    x, y = np.meshgrid(np.arange(0.0, 0.6, 0.005), np.arange(-0.5, 0.2, 0.005))
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.40)])
+
+
+def seen(*clusters: np.ndarray) -> list[Frame]:
+    """A frame of things over a table of which an image shows all that nothing hides."""
+    ground = table()
+    for points in clusters:
+        along = (ground - OVER)[:, None, :2] / (ground - OVER)[:, None, 2:]
+        shadow = (points - OVER)[None, ::50, :2] / (points - OVER)[None, ::50, 2:]
+        ground = ground[np.abs(along - shadow).max(axis=2).min(axis=1) > 0.012]
+    points = np.concatenate([*clusters, ground]).astype(np.float32)
+    sizes = [*map(len, clusters), len(ground)]
+    labels = np.repeat([*range(1, len(clusters) + 1), 0], sizes).astype(np.uint32)
+    return [Frame(1, tuple(map(boxed, clusters)), LabelledCloud(points, labels, OVER))]
+
+
 @pytest.mark.requirement("R-16")
 def test_what_rises_with_a_thing_as_one_body_is_a_part_of_it():
     found = in_two()
     T = se3.make(se3.rot_z(0.05), (0.0, 0.0, 0.12))
     risen = se3.apply(T, np.concatenate([HANDLE, HEAD]))
+    whole = lifted(seen(risen, NEIGHBOUR), found, risen, T)
+    assert whole.others == (found.others[1],)
+    assert len(object_points(whole.clouds)) == len(HANDLE) + len(HEAD)
+    alone = se3.apply(T, HANDLE)
+    assert lifted(seen(alone, HEAD, NEIGHBOUR), found, alone, T) is found
+    assert lifted(seen(risen, HEAD, NEIGHBOUR), found, risen, T) is found  # its like still lies there
+    assert lifted([Frame(1, ())], found, risen, T) is found
+    assert lifted(seen(NEIGHBOUR), found, risen[:0], T) is found
 
-    def seen(*clusters: np.ndarray) -> list[Frame]:
-        points = np.concatenate(clusters).astype(np.float32)
-        return [Frame(1, tuple(map(boxed, clusters)), LabelledCloud(points, np.ones(len(points), np.uint32), OVER))]
 
-    assert came_along(seen(risen, NEIGHBOUR), found, risen, T) == (found.others[0],)
-    assert came_along(seen(se3.apply(T, HANDLE), HEAD, NEIGHBOUR), found, se3.apply(T, HANDLE), T) == ()
-    assert came_along(seen(risen, HEAD, NEIGHBOUR), found, risen, T) == ()  # its like still lies there
-    assert came_along([Frame(1, ())], found, risen, T) == ()
-    assert came_along(seen(NEIGHBOUR), found, risen[:0], T) == ()
+@pytest.mark.requirement("R-16")
+def test_a_part_whose_end_alone_the_hand_does_not_hide_is_one():
+    found = in_two()
+    T = se3.make(p=(0.0, 0.0, 0.12))
+    risen = se3.apply(T, HEAD[HEAD[:, 1] > -0.20])
+    hidden = se3.apply(T, np.concatenate([HANDLE, HEAD[HEAD[:, 1] <= -0.20]]))
+    frame = seen(risen, hidden, NEIGHBOUR)[0]
+    cloud = frame.cloud
+    kept = cloud.labels != 2  # the hand is there: it is no part of the cloud
+    frame = replace(frame, cloud=replace(cloud, points=cloud.points[kept], labels=cloud.labels[kept]))
+    assert lifted([frame], found, risen, T).others == (found.others[1],)
+
+
+@pytest.mark.requirement("R-16")
+def test_what_was_taken_for_a_part_and_stays_is_another_thing():
+    points = np.concatenate([HANDLE, HEAD, NEIGHBOUR]).astype(np.float32)
+    labels = np.repeat([1, 1, 2], [len(HANDLE), len(HEAD), len(NEIGHBOUR)]).astype(np.uint32)
+    both = boxed(np.concatenate([HANDLE, HEAD]))
+    found = Sighting(both, (boxed(NEIGHBOUR),), 0, (LabelledCloud(points, labels, OVER),))
+    T = se3.make(p=(0.0, 0.0, 0.12))
+    frames = seen(se3.apply(T, HANDLE), HEAD, NEIGHBOUR)
+    risen = risen_points(frames, found, HELD.rise)
+    assert len(risen) == len(HANDLE)
+    thing = lifted(frames, found, risen, T)
+    assert thing.target.p_base == pytest.approx(boxed(HANDLE).p_base, abs=0.004)
+    assert thing.others[0] == found.others[0]
+    assert thing.others[1].p_base == pytest.approx(boxed(HEAD).p_base, abs=0.004)
 
 
 def test_a_thing_with_its_part_is_one():
