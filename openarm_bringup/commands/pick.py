@@ -246,7 +246,7 @@ def order(
                 data = {"placed": work.placed, "results": results}
                 return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED, data)
             seen = result.object_position
-            how = {"touched": result.attempts > 0, "held": ask.phase != "place" and result.outcome == "PARTIAL"}
+            how = {"touched": result.attempts > 0, "held": result.outcome == "PARTIAL"}
             work.done(ask, result.code, result.message, result.place_position, seen, **how)
             row = {"label": ask.label, "position": seen and list(seen), "code": result.code, "message": result.message}
             results.append({**row, "place": list(result.place_position) if result.success else None})

@@ -128,7 +128,7 @@ class Trials:
         while ask := order.next():
             trial = self._grasp(ask)
             answer, touched = trial.answer, trial.answer.attempts > 0
-            held = ask.phase != "place" and isinstance(answer, GraspOutcome) and answer.held
+            held = isinstance(answer, GraspOutcome) and answer.held
             left = order.done(ask, Code(answer.code), answer.message, *self._ends, touched=touched, held=held)
             self._seconds += trial.sim_s
             if answer.success:

@@ -32,8 +32,8 @@ _IN_VIEW = 0.025
 _STOOD, _STANDS = 0.015, 0.025
 #: What has risen with a thing is seen this near to where it is then, m; a part is seen so by more than this share.
 _PART, _MOST = 0.008, 0.5
-#: Of what was taken for a thing less than this may have stayed: else it has not risen.
-_MOST_LEFT = 0.8
+#: What stayed of a thing is another one where it was this share of it: of less, its neighbours may be seen there.
+_LEFT = 0.15
 #: A point is free where a ray as near to its own, rad, ends so far behind it, m.
 _RAY, _BEHIND = 0.010, 0.015
 #: Fewer points are no cluster.
@@ -119,7 +119,7 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
         T_now_before: (4, 4) how the hand has moved since it took hold.
     """
     cloud = next((frame.cloud for frame in reversed(frames) if frame.cloud is not None), None)
-    if cloud is None or len(risen) < _LEAST_POINTS:
+    if cloud is None:
         return sighting
     now = _Sight(cloud)
     standing = cloud.points[cloud.labels > 0]
@@ -135,8 +135,11 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
     parts = [one for one in sighting.others if _is_part(around[in_box(around, one)], rose, stays)]
     whole = joined(sighting, parts) if parts else sighting
     own = object_points(whole.clouds)
-    left = (rose(own) <= 0) & (stays(own) > 0)
-    return divided(whole, left) if _LEAST_POINTS <= np.count_nonzero(left) < _MOST_LEFT * len(own) else whole
+    up, down = rose(own) > 0, stays(own)
+    left = ~up & (down > 0)
+    gone = up | (down < 0)
+    apart = np.count_nonzero(left) >= max(_LEAST_POINTS, _LEFT * len(own)) and np.count_nonzero(gone) >= _LEAST_POINTS
+    return divided(whole, left) if apart else whole
 
 
 def _is_part(

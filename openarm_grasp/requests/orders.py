@@ -224,18 +224,19 @@ class Order:
             placed: (x, y) where the object stands now, when it was placed.
             seen: (x, y) where it was seen last, when it was.
             touched: An arm has moved for it.
-            held: A hand may hold it still: it is put down before anything else.
+            held: A hand may hold it still: it is put down before anything else; one that cannot do that ends the label.
         """
         label, after = self.label_of(request), self._moved
         self.left = [one for one in self.left if one.label != label or one.where is not None]
-        placing, self._held = request.phase == "place", label if held else ""
+        placing = request.phase == "place"
+        self._held = label if held and not placing else ""
         if placing and code is Code.NOT_READY:
             return None  # no hand holds anything: it is where it was seen last
         self._moved += touched or code is Code.OK
         if code is Code.OK:
             self._place(label, placed, placing=placing)
             return None
-        if placing or code in (*_OVER, Code.INVALID_ARGUMENT):
+        if (placing and held) or code in (*_OVER, Code.INVALID_ARGUMENT):
             self.failed[label] = f"{code}: {message}"
             return None
         self._in_vain += touched

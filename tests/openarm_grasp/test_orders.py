@@ -120,9 +120,16 @@ def test_what_a_hand_still_holds_is_put_down_before_anything_else():
 def test_a_hand_that_cannot_let_go_ends_the_order():
     order = Order(("anything",))
     order.done(order.next(), Code.PLACE_FAILED, "the hand keeps it", seen=(0.3, 0.0), touched=True, held=True)
-    order.done(order.next(), Code.PLACE_FAILED, "no free spot", touched=True)
+    order.done(order.next(), Code.PLACE_FAILED, "no free spot", touched=True, held=True)
     assert order.next() is None
     assert order.faults()[-1] == "anything: PLACE_FAILED: no free spot"
+
+
+def test_what_was_let_go_elsewhere_is_asked_for_again():
+    order = Order(("anything",))
+    order.done(order.next(), Code.GRASP_LOST, "it has turned", seen=(0.3, 0.0), touched=True, held=True)
+    order.done(order.next(), Code.PLACE_FAILED, "let go where it met something", seen=(0.2, 0.1), touched=True)
+    assert order.next() == GraspRequest("easiest anything", exclude_near=((0.3, 0.0), (0.2, 0.1)))
 
 
 def test_a_camera_that_shows_nothing_is_asked_again_three_times_at_most():

@@ -312,3 +312,28 @@ def test_what_has_turned_in_the_hand_is_put_back_though_the_map_shows_it_there(w
         assert plan.held == ()
         assert len(plan.ignore_regions) == 2
         assert plan.targets[0].approach_offset[2] > 0.05
+
+
+@pytest.mark.requirement("R-17")
+@pytest.mark.parametrize(("above", "let_go"), [(0.02, True), (0.05, False)])
+def test_what_meets_something_just_above_its_place_is_let_go_there(world, above, let_go):
+    def hand(arm):
+        plans = world.done(PlanPlace)
+        place = plans[-1].targets[0].T_base_tcp if plans else se3.make(p=(0.26, 0.2, 0.6))
+        return se3.make(p=(0.0, 0.0, above)) @ place
+
+    world.T_base_tcp = hand
+    world.fail(world.follows_path("put down"), Code.EXECUTION_FAILED, times=1)
+    outcome = world.grasp()
+    assert outcome.success, outcome.message
+    assert outcome.attempts == (1 if let_go else 2)
+
+
+def test_what_a_hand_holds_and_meets_something_on_its_way_back_is_let_go_there(world):
+    world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN, times=1)
+    world.lifted = lambda label: None  # it is still seen in its place
+    world.fail(lambda e: isinstance(e, MoveLinear) and e.what == "put back", Code.EXECUTION_FAILED)
+    outcome = world.grasp()
+    assert outcome.code is Code.GRASP_MISSED, outcome.message
+    assert not outcome.held
+    assert world.held is None

@@ -14,6 +14,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import GraspCandidate, propose
+from openarm_grasp.planning.retries import FailedGrasp
 from openarm_grasp.sampling.samplers import Sampling, make_sampler, refine
 from openarm_grasp.sampling.slabs import slabs
 from openarm_grasp.sampling.surface import View, fuse
@@ -56,6 +57,17 @@ def test_a_box_that_fits_keeps_its_exact_treatment():
     exact = propose(question.target, CONFIG, PARTS)
     assert [c.id for c in found] == [c.id for c in exact]
     assert all(c.apertures is None and c.held == () for c in found)
+
+
+def test_a_box_that_a_hand_has_met_beside_its_faces_is_grasped_on_its_cloud():
+    question = asked([box((0.05, 0.06, 0.05))], (0.05, 0.06, 0.05))
+    question = replace(question, target=replace(question.target, kind="box"))
+    first = make_sampler("auto").candidates(question)[0]
+    met = FailedGrasp.of(Code.HAND_COLLISION, "right", first, question.target)
+    found = make_sampler("auto").candidates(replace(question, failed=(met,)))
+    assert all(c.apertures is not None for c in found)
+    missed = replace(met, code=Code.GRASP_MISSED)
+    assert make_sampler("auto").candidates(replace(question, failed=(missed,)))[0].apertures is None
 
 
 @pytest.mark.parametrize(("size", "measured"), [((0.22, 0.12, 0.05), True), ((0.05, 0.06, 0.05), False)])

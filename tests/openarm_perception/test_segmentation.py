@@ -12,6 +12,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 from openarm_perception.segmentation.clusters import Segmentation, segment
+from openarm_perception.segmentation.colors import join_smooth
 from openarm_perception.segmentation.divide import SegmentationConfig
 from openarm_perception.segmentation.grouping import group
 from openarm_perception.segmentation.parts import joined
@@ -237,12 +238,36 @@ def test_parts_that_touch_are_one_thing_for_a_hand_and_boxes_apart_are_two(table
     assert joined[1] > apart[2]
 
 
+def piece(n: float, half: float = 0.018):
+    """A square piece that touches those of the next numbers."""
+    edge = np.arange(-half, half + 1e-9, 0.004)
+    grid = np.stack(np.meshgrid(edge, edge, [0.0]), axis=-1).reshape(-1, 3)
+    return SimpleNamespace(points=grid + np.array([0.04 * n, 0.0, 0.4]), shape=SimpleNamespace(kind="unknown"))
+
+
 def test_more_pieces_than_a_thing_has_parts_are_a_heap_and_stay_pieces():
-    grid = np.stack(np.meshgrid(np.arange(10), np.arange(10), [0.0]), axis=-1).reshape(-1, 3) * 0.004
-
-    def piece(n):
-        return SimpleNamespace(points=grid + np.array([0.04 * n, 0.0, 0.4]), shape=SimpleNamespace(kind="unknown"))
-
     assert list(joined([piece(n) for n in range(3)])) == [0, 0, 0]
     assert list(joined([piece(n) for n in range(4)])) == [0, 1, 2, 3]
     assert list(joined([*(piece(n) for n in range(4)), piece(8), piece(9)])) == [0, 1, 2, 3, 4, 4]
+    assert list(joined([piece(n) for n in range(3)], (1, 2, 1))) == [0, 1, 2]  # one of them was two
+
+
+def test_two_bodies_are_two_things_though_they_touch():
+    body, other, handle = piece(0.0, half=0.04), piece(2.05, half=0.04), piece(-1.46)
+    assert list(joined([body, handle])) == [0, 0]
+    assert list(joined([body, other])) == [0, 1]
+    assert list(joined([body, other, handle])) == [0, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("step", "broken", "things"), [(0, 0, 1), (10, 0, 1), (60, 0, 2), (0, 4, 2)], ids=["alike", "shade", "edge", "deep"]
+)
+def test_patches_without_an_edge_between_them_are_one_thing_whatever_their_colour(step, broken, things):
+    patch = np.zeros((24, 24), np.int32)
+    patch[2:22, 2:12], patch[2:22, 12:22] = 1, 2
+    rgb = np.zeros((24, 24, 3), np.uint8)
+    rgb[::4], rgb[1::4], rgb[2::4], rgb[3::4] = 20, 60, 120, 180  # stripes across both
+    rgb[:, 12:] += np.uint8(step)
+    border = np.tile(np.array([[1, 2, broken]], np.int32), (20, 1))
+    root = join_smooth(np.arange(3, dtype=np.int32), patch, border, rgb)
+    assert len({int(root[1]), int(root[2])}) == things
