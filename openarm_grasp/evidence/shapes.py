@@ -30,6 +30,8 @@ _SAME_THING = 0.3
 _LOWER, _LOWER_SHARE = 0.015, 0.25
 #: Of the points of a thing that has not moved so many lie where it was, %: the rest may be the edge of the hand.
 _MOST = 85.0
+#: Fewer points of what hangs in a hand may be of its edge, or of something else.
+_FEW = 30
 #: Least horizontal part of a closing axis about which an end goes down, least turn, rad, and points that show it.
 _LEVEL, _TURNED, _LEAST_POINTS = 0.5, 0.12, 10
 #: What a camera over the table sees of a thing wherever it stands: the highest point in each cell of this edge, m.
@@ -140,11 +142,11 @@ def judge_held(standing: Array, points: Array, T_now_before: Array, config: Held
 
     Args:
         standing: (n, 3) voxels of what was seen before, down to the table.
-        points: (n, 3) of what is seen of it; none proves nothing.
+        points: (n, 3) of what is seen of it; few prove nothing.
         T_now_before: (4, 4) how the hand has moved since it took hold.
         config: Thresholds.
     """
-    if not len(points) or not len(standing):
+    if len(points) < _FEW or not len(standing):
         return CameraVerdict(Code.OK, "the hand hides what it holds")
     out, _ = KDTree(standing).query(se3.apply(se3.inverse(T_now_before), points))
     off, limit = 1e3 * float(np.percentile(out, _MOST)), 1e3 * config.askew

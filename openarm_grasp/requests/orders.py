@@ -31,7 +31,7 @@ _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 #: With these the camera had not shown enough yet: another look may.
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
 #: Requests in vain, one after the other, until a label is given up: that saw nothing, and that moved an arm.
-_UNSEEN, _IN_VAIN = 3, 6
+_UNSEEN, _IN_VAIN = 3, 10
 #: Things that are asked for by their places at most, while nothing moves.
 _MOST = 10
 #: What is left so near to where something was left before is that, m.

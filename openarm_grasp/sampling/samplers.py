@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import degrees, hypot, radians, sin
 from typing import Any, Protocol
 
@@ -21,18 +21,15 @@ from openarm_common.octree.distance_field import DistanceField
 from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.candidates import UP, Box, GraspCandidate
+from openarm_grasp.planning.candidates import UP, GraspCandidate
 from openarm_grasp.planning.retries import FailedGrasp, centre_of_mass, has_met, proposed
 from openarm_grasp.sampling.antipodal import Antipodal, Search
 from openarm_grasp.sampling.hand_shape import HandShape
-from openarm_grasp.sampling.slabs import slabs
+from openarm_grasp.sampling.slabs import eased, slabs
 from openarm_grasp.sampling.surface import Surface
 
 #: Leaning away from the shoulder reaches furthest; as of the grasps of boxes.
 _SIDE_WEIGHT = 0.15
-#: The top of what is grasped is this much lower for the planner, m: boxes about what is round reach beyond it, and
-#: whether the palm has room there the sampler knows better.
-_EASED = 0.005
 #: A grasp that is searched at the second look is this near to the one before it, m, rad.
 _AROUND, _TURNED = 0.03, radians(30.0)
 
@@ -217,7 +214,7 @@ def _none(search: Search, asked: Sampling, surface: Surface) -> OpenArmError:
 def _candidates(found: Sequence[Antipodal], asked: Sampling, surface: Surface) -> tuple[GraspCandidate, ...]:
     config, label = asked.config, asked.target.label
     made = slabs(label, surface.solid, surface.step, gap=config.approach.table_gap) if found else ()
-    held = tuple(_eased(box) for box in made)
+    held = tuple(eased(box) for box in made)
     ranked: list[GraspCandidate] = []
     for n, one in enumerate(found):
         side = _SIDE_WEIGHT * sin(one.tilt) * _outward(one.T_base_tcp, asked.shoulder_xy)
@@ -239,13 +236,6 @@ def _candidates(found: Sequence[Antipodal], asked: Sampling, surface: Surface) -
         )
     ranked.sort(key=lambda c: -c.score)
     return tuple(ranked)
-
-
-def _eased(box: Box) -> Box:
-    """A box whose top is a little lower."""
-    less = min(_EASED, 0.25 * float(box.size[2]))
-    T = box.T_frame_box @ se3.make(p=(0.0, 0.0, -0.5 * less))
-    return replace(box, T_frame_box=T, size=box.size - np.array([0.0, 0.0, less]))
 
 
 def _outward(T_base_tcp: Array, shoulder_xy: Sequence[float]) -> float:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,9 @@ from openarm_common.types import Array
 from openarm_common.walls import wall_yaw
 from openarm_grasp.planning.candidates import Box
 
+#: The top of what is grasped is this much lower for the planner, m: boxes about what is round reach beyond it, and
+#: whether the palm has room there the sampler knows better.
+EASED = 0.005
 #: Cuts of a box are tried at so many places along each axis.
 _CUTS = 8
 
@@ -58,6 +62,13 @@ def slabs(
         name = f"target/{label}_{n}" if len(parts) > 1 else f"target/{label}"
         boxes.append(Box(name, se3.make(R, R @ (0.5 * (low + high))), high - low))
     return tuple(boxes)
+
+
+def eased(box: Box, less: float = EASED) -> Box:
+    """A box whose top is lower, m, by a quarter of its height at most."""
+    less = min(less, 0.25 * float(box.size[2]))
+    T = box.T_frame_box @ se3.make(p=(0.0, 0.0, -0.5 * less))
+    return replace(box, T_frame_box=T, size=box.size - np.array([0.0, 0.0, less]))
 
 
 def _volume(points: Array, step: float) -> float:

@@ -36,6 +36,7 @@ from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import Grasp
 from openarm_grasp.robot.interface import Frames, Planned
 from openarm_grasp.robot.skills import reraise_stop
+from openarm_grasp.sampling.slabs import EASED, eased
 
 if TYPE_CHECKING:
     from openarm_grasp.strategies.run import Run
@@ -319,8 +320,9 @@ def regrasped(run: Run, grasp: Grasp, sighting: Sighting) -> Grasp:
     """A grasp of an object of which other points turned out to be its own."""
     candidate, label, gap = grasp.candidate, sighting.target.label, run.config.approach.table_gap
     if candidate.held:
-        held = standing_boxes(label, object_points(sighting.clouds[-1:]), sighting.target.bottom, gap)
-        candidate = replace(candidate, held=held)
+        made = standing_boxes(label, object_points(sighting.clouds[-1:]), sighting.target.bottom, gap)
+        # up to a column too high, besides
+        candidate = replace(candidate, held=tuple(eased(box, 2.0 * EASED) for box in made))
     run.findings.sighting, run.place_plan = sighting, None
     return replace(grasp_of(run, grasp.arm, sighting, candidate), closed=grasp.closed)
 
