@@ -30,6 +30,8 @@ from openarm_grasp.perception.detections import (
 _IN_VIEW = 0.025
 #: What is seen this near to what stood there is that, and what is seen this near to its middle may be, m.
 _STOOD, _STANDS = 0.015, 0.025
+#: Nothing that hangs in the hand reaches farther from where it stood, m.
+_REACH = 0.35
 #: What has risen with a thing is seen this near to where it is then, m; a part is seen so by more than this share.
 _PART, _MOST = 0.008, 0.5
 #: What stayed of a thing is another one where it was this share of it: of less, its neighbours may be seen there.
@@ -102,6 +104,7 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
             if now.top - before.top >= rise and away <= 0.5 * (now.extent + before.extent):
                 found.append(points)
     clouds, points = sighting.clouds[-1:], np.concatenate(found)
+    points = points[np.linalg.norm(points - before.centroid, axis=1) < _REACH]
     off, _ = KDTree(np.concatenate([object_points(clouds), points_around(clouds)])).query(points)
     return points[off > _STOOD]
 

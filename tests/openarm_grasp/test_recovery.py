@@ -6,14 +6,17 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Frame
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import Frames, PlanGrasp, PlanPlace
+from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Wait
 
@@ -337,3 +340,28 @@ def test_what_a_hand_holds_and_meets_something_on_its_way_back_is_let_go_there(w
     assert outcome.code is Code.GRASP_MISSED, outcome.message
     assert not outcome.held
     assert world.held is None
+
+
+@pytest.mark.requirement("R-17")
+@pytest.mark.parametrize("rises", [True, False])
+def test_a_hand_with_no_way_home_rises_first(monkeypatch, rises):
+    moves = []
+
+    class Robot:
+        def check(self):
+            pass
+
+        async def move(self, arm, to, what, obstacles=()):
+            moves.append(what)
+            if len(moves) == 1 or (len(moves) == 2 and not rises):
+                raise OpenArmError(Code.NO_PLAN, what)
+
+    skills = Skills.__new__(Skills)
+    skills._config, skills.robot = GraspConfig(), Robot()
+    monkeypatch.setattr(Skills, "T_base_tcp", lambda self, arm: np.eye(4))
+    work = skills._home("left", ())
+    with pytest.raises(StopIteration if rises else OpenArmError) as error:
+        work.send(None)
+    expected = ["left arm: go home", "left arm: rise", "left arm: go home"]
+    assert moves == expected[: 3 if rises else 2]
+    assert rises or error.value.message == "left arm: go home"
