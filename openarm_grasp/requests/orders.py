@@ -93,7 +93,7 @@ class Left:
         where: Where it was seen, base frame, m; None: that is not known.
         code: Why it was left.
         why: Why, in a sentence.
-        after: Requests that had moved something when it was asked for.
+        after: Requests by then after which things lay, or were seen, otherwise.
     """
 
     label: str
@@ -141,10 +141,12 @@ class Order:
     _before: list[Left] = field(default_factory=list[Left])
     #: Places that things were asked for by in this round.
     _by_place: list[Spot] = field(default_factory=list[Spot])
-    #: Requests that have moved something; of the newest, how many in vain, and how many that saw nothing.
+    #: Requests after which things lay, or were seen, otherwise; since the newest success, how many moved something in
+    #: vain, saw nothing, or did not see a thing at its place.
     _moved: int = 0
     _in_vain: int = 0
     _unseen: int = 0
+    _otherwise: int = 0
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -247,7 +249,11 @@ class Order:
             if code not in _GONE:  # what is not seen there any more stays on the list of what was left
                 self.left = [one for one in self.left if one not in tuple(self._at(spot))]
         if where is None and code in _GONE:
-            return None if request.object_at is not None else self._none_left(label, code, message)
+            if request.object_at is None:
+                return self._none_left(label, code, message)
+            self._otherwise += 1  # it is seen as a part of something else now
+            self._moved += self._otherwise < _UNSEEN
+            return None
         self._unseen = self._unseen + 1 if where is None and code in _NOT_SEEN else 0
         if self._in_vain >= _IN_VAIN or self._unseen >= _UNSEEN or (where is None and not self._unseen):
             self._asked.add(label)
@@ -259,7 +265,7 @@ class Order:
         """Note that an object of a label was placed."""
         if placing and self.left:
             self.left.pop()  # what was left in the hand
-        self._in_vain, self._unseen, self._before = 0, 0, []
+        self._in_vain, self._unseen, self._otherwise, self._before = 0, 0, 0, []
         self.placed.append(label)
         if len(placed) >= 2:
             self._stand.append((float(placed[0]), float(placed[1])))

@@ -32,7 +32,7 @@ _PARTS = 3
 #: What is joined is no larger than this, m: things that a hand grasps are long or wide, not both.
 _LONG, _WIDE = 0.38, 0.20
 #: And has one body: of its parts no two are wider than this, m.
-_BODY = 0.065
+_BODY = 0.095
 
 
 def joined(clusters: Sequence[Cluster], pieces: Sequence[int] = ()) -> Ints:

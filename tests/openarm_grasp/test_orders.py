@@ -321,6 +321,22 @@ def test_what_a_push_has_moved_out_of_sight_does_not_end_an_order():
     assert order.next() == GraspRequest("easiest anything")
 
 
+@pytest.mark.requirement("R-17")
+def test_what_is_not_at_its_place_may_be_a_part_of_something_that_is_seen_whole_now():
+    order, asked = Order(("anything",)), 0
+    order.done(order.next(), Code.IN_COLLISION, "no room", seen=(0.43, 0.06, 0.4))
+    order.done(order.next(), Code.UNKNOWN_OBJECT, "no more")
+    ask = order.next()
+    assert ask.object_at == (0.43, 0.06)
+    order.done(ask, Code.UNKNOWN_OBJECT, "it is seen at (0.36, 0.07)")
+    assert order.next() == GraspRequest("easiest anything")
+    while ask := order.next():
+        asked += 1
+        assert asked < 10
+        order.done(ask, Code.UNKNOWN_OBJECT, "no more")
+    assert [one.code for one in order.left] == [Code.IN_COLLISION]
+
+
 @pytest.mark.requirement("R-17", "P-02")
 def test_what_is_seen_for_a_moment_does_not_keep_for_good_from_what_it_is_a_part_of():
     order = Order(("anything",))

@@ -253,7 +253,7 @@ def test_more_pieces_than_a_thing_has_parts_are_a_heap_and_stay_pieces():
 
 
 def test_two_bodies_are_two_things_though_they_touch():
-    body, other, handle = piece(0.0, half=0.04), piece(2.05, half=0.04), piece(-1.46)
+    body, other, handle = piece(0.0, half=0.06), piece(3.05, half=0.06), piece(-1.97)
     assert list(joined([body, handle])) == [0, 0]
     assert list(joined([body, other])) == [0, 1]
     assert list(joined([body, other, handle])) == [0, 1, 0]
