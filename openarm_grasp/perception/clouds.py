@@ -153,7 +153,8 @@ def _is_part(
         return False
     up, down = rose(points), stays(points)
     seen, there = np.count_nonzero(up), np.count_nonzero(up > 0)
-    return there >= _LEAST_POINTS // 2 and there > _MOST * seen and np.count_nonzero(down > 0) < _MOST * len(points)
+    stayed = np.count_nonzero(down > 0)
+    return bool(there >= _LEAST_POINTS // 2 and there > _MOST * seen and stayed < _MOST * len(points))
 
 
 class _Sight:
