@@ -122,7 +122,7 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
         T_now_before: (4, 4) how the hand has moved since it took hold.
     """
     cloud = next((frame.cloud for frame in reversed(frames) if frame.cloud is not None), None)
-    if cloud is None:
+    if cloud is None or not len(cloud.points):
         return sighting
     now = _Sight(cloud)
     standing = cloud.points[cloud.labels > 0]

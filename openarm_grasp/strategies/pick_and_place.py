@@ -52,8 +52,6 @@ _BLIND = (Code.NOT_READY, Code.STALE_DATA, Code.TIMEOUT)
 _LIFT_FRAMES = 2
 #: Share of the tolerance of a place in which the middle of any shape must be seen: it may be millimetres elsewhere.
 _SEEN_WITHIN = 0.75
-
-
 #: What meets something on its way down to its place is let go this high above it, m; what has turned, anywhere.
 _MET_AT = 0.03
 
@@ -413,8 +411,10 @@ async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget) -> 
     try:
         await run.robot.follow(grasp.arm, plan.approach, "put down", carrying=True)
     except OpenArmError as error:
+        if error.code is not Code.EXECUTION_FAILED:
+            raise
         above = float((run.robot.T_base_tcp(grasp.arm) - target.T_base_tcp)[2, 3])
-        if error.code is not Code.EXECUTION_FAILED or (above > _MET_AT and not grasp.turned):
+        if above > _MET_AT and not grasp.turned:
             raise
         run.robot.warn(f"{error.message}: what the hand holds meets something below, and is let go there")
 

@@ -266,6 +266,8 @@ def test_what_rises_with_a_thing_as_one_body_is_a_part_of_it():
     assert lifted(seen(alone, HEAD, NEIGHBOUR), found, alone, T) is found
     assert lifted(seen(risen, HEAD, NEIGHBOUR), found, risen, T) is found  # its like still lies there
     assert lifted([Frame(1, ())], found, risen, T) is found
+    blind = LabelledCloud(np.empty((0, 3), np.float32), np.empty(0, np.uint32), OVER)
+    assert lifted([Frame(1, (), blind)], found, risen, T) is found
     assert lifted(seen(NEIGHBOUR), found, risen[:0], T) is found
 
 
