@@ -14,17 +14,8 @@ from openarm_common.detection import Detection, gap
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array, Floats
 from openarm_grasp.evidence.shapes import Cluster, ClusterFrame
-from openarm_grasp.perception.detections import (
-    SAME_PLACE,
-    Frame,
-    Sighting,
-    apart,
-    divided,
-    in_box,
-    joined,
-    object_points,
-    points_around,
-)
+from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart
+from openarm_grasp.perception.sightings import divided, in_box, joined, object_points, points_around
 
 #: A place is in view where a point lies this near to it, seen from above, m.
 _IN_VIEW = 0.025

@@ -17,7 +17,8 @@ from openarm_common import se3
 from openarm_common.detection import gap
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.perception.detections import Sighting, in_box, object_points, points_around
+from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.sightings import in_box, object_points, points_around
 from openarm_grasp.planning.candidates import UP, Box, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
 

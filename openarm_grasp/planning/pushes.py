@@ -21,7 +21,8 @@ from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Sighting, in_box, object_points, points_around
+from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.sightings import in_box, object_points, points_around
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, tips_height
 from openarm_grasp.planning.neighbours import standing_boxes, tops
 

@@ -13,7 +13,6 @@ import numpy as np
 from openarm_common.detection import Detection, gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.hand import HandParts
-from openarm_common.types import Array
 from openarm_common.wanted import describe
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import (
@@ -21,10 +20,11 @@ from openarm_grasp.perception.detections import (
     Frame,
     Sighting,
     UntrustedError,
+    distance_to,
     in_view,
-    object_points,
     on_table,
 )
+from openarm_grasp.perception.sightings import object_points
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.arms import out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, little_turns, shorter
@@ -149,7 +149,7 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
         hand = run.robot.T_base_tcp(kept.arm)[:2, 3]
         reach = float(np.linalg.norm(target.size[:2]))
         # what hangs in the hand may be seen there
-        others = (d for d in newest.detections if d.label != target.label or _from(d, hand) > reach)
+        others = (d for d in newest.detections if d.label != target.label or distance_to(d, hand) > reach)
         sighting = replace(kept.sighting, others=_standing(others, top_z), t_ns=newest.t_ns)
     else:
         try:
@@ -168,10 +168,6 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
     if kept or run.size is None or any(d.label == sighting.target.label for d in sighting.others):
         run.size = sighting.target.size
     return sighting
-
-
-def _from(d: Detection, xy: Array) -> float:
-    return float(np.linalg.norm(d.p_base[:2] - xy))
 
 
 def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ...]:

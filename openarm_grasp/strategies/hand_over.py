@@ -20,7 +20,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import HandOverConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Sighting, seen_at
+from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.sightings import seen_at
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.planning.options import NO_WAY

@@ -32,7 +32,8 @@ from openarm_grasp.perception.clouds import (
     risen_points,
     stands,
 )
-from openarm_grasp.perception.detections import NEXT_TO, Frame, apart, object_points, points_around
+from openarm_grasp.perception.detections import NEXT_TO, Frame, apart
+from openarm_grasp.perception.sightings import object_points, points_around
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.planning.place import place_targets, placing_error

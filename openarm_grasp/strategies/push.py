@@ -11,8 +11,9 @@ there the hand pushes it together with what it meets, and what comes of it is ob
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -21,7 +22,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_common.wanted import EASIEST
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Sighting, seen_at
+from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.sightings import seen_at
 from openarm_grasp.planning.candidates import GraspCandidate, displaced
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.planning.neighbours import cornered, crowded
@@ -39,6 +41,8 @@ from openarm_grasp.strategies.pick_and_place import pick_and_place
 _SWEEPS = 10
 #: Turns of a hand that meets things of any shape, deg.
 _TURNS = (0.0, 30.0, -30.0)
+#: What a push moves less than this, m, is not pushed again in directions that near (cosine) to it.
+_MOVES, _SAME_WAY = 0.01, 0.5
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,11 @@ class Push:
         (x0, y0), (x1, y1) = self.start, self.end
         return f"the {self.arm} hand pushes it from ({x0:.3f}, {y0:.3f}) to ({x1:.3f}, {y1:.3f}) m, {self.why}"
 
+    @property
+    def ahead(self) -> Array:
+        """(2,) direction."""
+        return direction(self.end - self.start)
+
 
 async def push(task: Task) -> GraspOutcome | None:
     """Push an object that no arm can grasp where it is into reach, observe, and pick it; several times if need be."""
@@ -75,12 +84,13 @@ async def push(task: Task) -> GraspOutcome | None:
     found = task.findings.need_sighting()
     if _easiest(task) and crowded(found) and not found.target.kind:
         return None  # others may be taken first, after which it may stand alone
+    blocked: list[Array] = []
     for number in range(1, task.context.config.push.most + 1):
         found = task.findings.need_sighting()
         if not (found.target.measured or _may_sweep(task, found)):
             return None  # how far it reaches is not known
         try:
-            planned = await _plan(task, found)
+            planned = await _plan(task, found, blocked)
         except OpenArmError as error:
             if number == 1 or error.code not in NO_WAY:
                 raise
@@ -97,12 +107,19 @@ async def push(task: Task) -> GraspOutcome | None:
         except OpenArmError as error:
             return replace(refused, code=error.code, message=error.message)
         task.displaced = "after the pushes"
+        if np.linalg.norm(pushed.target.p_base[:2] - planned.start) < _MOVES:
+            blocked.append(planned.ahead)
         refused = await pick_and_place(task, replace(task.request.about(pushed), why=observed))
         if refused.success:
             return replace(refused, message=f"{refused.message}; {observed}")
         if not task.may_go_on(refused) or task.findings.place_refused:
             break
     return refused
+
+
+def _is_open(way: Array, blocked: Sequence[Array]) -> bool:
+    """Whether (2,) leads elsewhere than the directions in which a push did not move the object."""
+    return all(float(direction(way) @ one) < _SAME_WAY for one in blocked)
 
 
 def _easiest(task: Task) -> bool:
@@ -120,8 +137,13 @@ def _may_sweep(task: Task, found: Sighting) -> bool:
     return not (task.request.dry_run or _easiest(task)) and (crowded(found) or blocked)
 
 
-async def _plan(task: Task, found: Sighting) -> Push:
+async def _plan(task: Task, found: Sighting, blocked: Sequence[Array]) -> Push:
     """A push into reach; in a crowd, where there is none, one through it.
+
+    Args:
+        task: That it is a part of.
+        found: The object and its neighbours.
+        blocked: (2,) directions in which a push did not move it.
 
     Raises:
         OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
@@ -129,25 +151,26 @@ async def _plan(task: Task, found: Sighting) -> Push:
     fault = ""
     if found.target.measured:
         try:
-            return await plan_push(task, found)
+            return await plan_push(task, found, blocked)
         except OpenArmError as error:
             if error.code not in NO_WAY or not _may_sweep(task, found):
                 raise
             fault = f"{error.message}; "
     try:
-        return await plan_sweep(task, found)
+        return await plan_sweep(task, found, blocked)
     except OpenArmError as error:
         raise OpenArmError(error.code, f"{fault}{error.message}") from error
 
 
-async def plan_push(task: Task, found: Sighting) -> Push:
-    """Find a push after which the object can be grasped.
+async def plan_push(task: Task, found: Sighting, blocked: Sequence[Array]) -> Push:
+    """Find a push after which the object can be grasped; arguments as `_plan`.
 
     Raises:
         OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
     """
     faults: list[str] = []
-    ends = destinations(found.target, found.others, task.context)
+    start = found.target.p_base[:2]
+    ends = [end for end in destinations(found.target, found.others, task.context) if _is_open(end - start, blocked)]
     ways = _ways_alone(task.context, found) if ends else {}
     for end in ends:
         x, y = end
@@ -215,16 +238,18 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
     raise OpenArmError(Code.UNREACHABLE, f"no hand comes behind it: {'; '.join(faults)}")
 
 
-async def plan_sweep(task: Task, found: Sighting) -> Push:
-    """Find a line through the crowd that an object stands in.
+async def plan_sweep(task: Task, found: Sighting, blocked: Sequence[Array]) -> Push:
+    """Find a line through the crowd that an object stands in; arguments as `_plan`.
 
     Raises:
         OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
     """
     context, robot, faults = task.context, task.robot, list[str]()
-    for arm in context.arm_order("auto", float(found.target.p_base[1])):
+    start = found.target.p_base[:2]
+    for arm in context.arm_order("auto", float(start[1])):
         hand = closed_hand(robot.description, arm)
-        for sweep in sweeps(found, hand, context)[:_SWEEPS]:
+        lines = (one for one in sweeps(found, hand, context) if _is_open(one.freed - start, blocked))
+        for sweep in islice(lines, _SWEEPS):
             ways = push_ways(sweep.met, sweep.end, context.config, hand, context.hand, _TURNS)
             if not ways:
                 faults.append(f"{arm} hand: what stands there is too thin for it")
@@ -236,7 +261,7 @@ async def plan_sweep(task: Task, found: Sighting) -> Push:
                     raise
                 faults.append(error.message)
                 continue
-            return Push(arm, found.target.p_base[:2], sweep.freed, ways[plan.chosen], plan, "through what is near it")
+            return Push(arm, start, sweep.freed, ways[plan.chosen], plan, "through what is near it")
     why = f"{faults[0]} ({len(faults) - 1} other lines refused)" if faults else "there is no room around it"
     raise OpenArmError(Code.UNREACHABLE, f"nor can it be pushed out of what is near it: {why}")
 

@@ -9,7 +9,8 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.evidence.verdicts import Verdict
-from openarm_grasp.perception.detections import Sighting, standing_at
+from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.sightings import standing_at
 from openarm_grasp.planning import retries
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.offers import asked, offers

@@ -18,7 +18,8 @@ from openarm_common.robot.folder import robot_work
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.verdicts import Evidence
-from openarm_grasp.perception.detections import Frame, standing_at
+from openarm_grasp.perception.detections import Frame
+from openarm_grasp.perception.sightings import standing_at
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest

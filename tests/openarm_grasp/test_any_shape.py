@@ -17,7 +17,8 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.perception.detections import Frame, Sighting, in_box
+from openarm_grasp.perception.detections import Frame, Sighting
+from openarm_grasp.perception.sightings import in_box
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.sampling.views import views_of
 from openarm_grasp.strategies import find

@@ -15,7 +15,8 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.config import DetectConfig
-from openarm_grasp.perception.detections import Frame, average, find, in_base, on_table, seen_at, sticks_out
+from openarm_grasp.perception.detections import Frame, average, find, in_base, on_table, sticks_out
+from openarm_grasp.perception.sightings import seen_at
 
 
 def seen(label="red", x=0.26, y=-0.2, z=0.425, yaw=0.0, size=(0.04, 0.06, 0.05), score=0.9) -> Detection:

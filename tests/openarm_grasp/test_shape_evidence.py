@@ -24,7 +24,8 @@ from openarm_grasp.evidence.shapes import (
 )
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
 from openarm_grasp.perception.clouds import came_next_to, lifted, risen_points
-from openarm_grasp.perception.detections import Frame, Sighting, joined, object_points
+from openarm_grasp.perception.detections import Frame, Sighting
+from openarm_grasp.perception.sightings import joined, object_points
 from openarm_grasp.planning.candidates import GraspCandidate
 from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.requests.task import Grasp

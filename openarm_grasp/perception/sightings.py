@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of an object and of what is around it in a sighting, and the object regrouped or moved. Base frame, m."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.detection import Detection
+from openarm_common.labelled_cloud import LabelledCloud
+from openarm_common.types import Array, Floats
+from openarm_grasp.perception.detections import Sighting
+
+#: Points so far out of the box of a thing are its own, m.
+_OUT = 0.004
+
+
+def object_points(clouds: Sequence[LabelledCloud]) -> Array:
+    """Return the points (n, 3) of the object in clouds whose points labelled 1 are its."""
+    mine = (cloud.points[cloud.labels == 1].astype(np.float64) for cloud in clouds)
+    return np.concatenate([np.empty((0, 3)), *mine])
+
+
+def points_around(clouds: Sequence[LabelledCloud]) -> Array:
+    """Points (n, 3) of what stands around an object in clouds whose points labelled 1 are its."""
+    return np.concatenate([np.empty((0, 3)), *(cloud.points[cloud.labels > 1].astype(np.float64) for cloud in clouds)])
+
+
+def in_box(points: Array | Floats, one: Detection) -> NDArray[np.bool_]:
+    """Which of the points (n, 3) are in the box about a thing."""
+    local = se3.apply(se3.inverse(one.T_base_object), points.astype(np.float64))
+    return np.asarray((np.abs(local) <= 0.5 * one.size + _OUT).all(axis=1), dtype=np.bool_)
+
+
+def joined(found: Sighting, parts: Sequence[Detection]) -> Sighting:
+    """An object together with what was taken for others, and is a part of it.
+
+    Args:
+        found: The object and what is around it.
+        parts: Of `found.others`.
+    """
+    clouds: list[LabelledCloud] = []
+    for cloud in found.clouds:
+        part = np.any([in_box(cloud.points, one) for one in parts], axis=0) & (cloud.labels > 1)
+        clouds.append(replace(cloud, labels=np.where(part, 1, cloud.labels).astype(np.uint32)))
+    whole = (found.target, *parts)
+    target = _about(found.target, object_points(clouds), whole)
+    others = tuple(one for one in found.others if all(one is not part for part in parts))
+    return replace(found, target=target, others=others, clouds=tuple(clouds))
+
+
+def divided(found: Sighting, left: NDArray[np.bool_]) -> Sighting:
+    """An object without what was taken for a part of it, and is another thing.
+
+    Args:
+        found: The object and what is around it.
+        left: (n,) which of its points, as of `object_points`, are the other's.
+    """
+    clouds: list[LabelledCloud] = []
+    begin = 0
+    for cloud in found.clouds:
+        mine = np.flatnonzero(cloud.labels == 1)
+        labels = cloud.labels.copy()
+        labels[mine[left[begin : begin + len(mine)]]] = 2
+        begin += len(mine)
+        clouds.append(replace(cloud, labels=labels))
+    points, whole = object_points(found.clouds), (found.target,)
+    target, rest = (_about(found.target, part, whole) for part in (points[~left], points[left]))
+    return replace(found, target=target, others=(*found.others, rest), clouds=tuple(clouds))
+
+
+def _about(like: Detection, points: Array, whole: Sequence[Detection]) -> Detection:
+    """A detection of points (n, 3), turned as another one, that stands as deep as what it was seen as."""
+    R = like.T_base_object[:3, :3]
+    local = points @ R
+    low, high = local.min(axis=0), local.max(axis=0)
+    low[2] = min(one.bottom for one in whole)
+    if len(whole) > 1:
+        high[2] = max(one.top for one in whole)
+    T = se3.make(R, R @ (0.5 * (low + high)))
+    measured = all(one.measured for one in whole)
+    return replace(like, T_base_object=T, size=high - low, kind="", round=False, measured=measured)
+
+
+def standing_at(target: Detection, xy: Sequence[float] | Array, turn: float = 0.0) -> Detection:
+    """The object as it would be observed elsewhere, turned by `turn` about the vertical unless it is round."""
+    p = np.array([xy[0], xy[1], target.p_base[2]])
+    turn = 0.0 if target.round else turn
+    return replace(target, T_base_object=se3.make(se3.rot_z(turn) @ target.T_base_object[:3, :3], p))
+
+
+def seen_at(found: Sighting, xy: Sequence[float] | Array, turn: float = 0.0) -> Sighting:
+    """The object with its points as it would be observed elsewhere; as `standing_at`."""
+    there = standing_at(found.target, xy, turn)
+    T = there.T_base_object @ se3.inverse(found.target.T_base_object)
+    clouds: list[LabelledCloud] = []
+    for cloud in found.clouds:
+        points, mine = cloud.points.copy(), cloud.labels == 1
+        points[mine] = se3.apply(T, points[mine].astype(np.float64))
+        clouds.append(replace(cloud, points=points))
+    return replace(found, target=there, clouds=tuple(clouds))
