@@ -54,7 +54,7 @@ _LIFT_FRAMES = 2
 #: Share of the tolerance of a place in which the middle of any shape must be seen: it may be millimetres elsewhere.
 _SEEN_WITHIN = 0.75
 #: What meets something on its way down to its place is let go this high above it, m; what has turned, anywhere.
-_MET_AT = 0.03
+_MET_AT = 0.015
 
 
 class ObjectKeptError(OpenArmError):
