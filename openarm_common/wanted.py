@@ -65,6 +65,11 @@ def fits(text: str, one: Described) -> bool:
     return not words or _read(words, one) is not None
 
 
+def takes_all(text: str) -> bool:
+    """Return whether words ask for whatever there is, as `anything` does; the easiest first, or any."""
+    return all(word in _ANY | _FILLERS or word == EASIEST for word in _words(text))
+
+
 def select(text: str, detections: Sequence[Detection]) -> tuple[Detection, ...]:
     """Return the objects that are asked for.
 

@@ -131,6 +131,8 @@ class Trials:
             held = isinstance(answer, GraspOutcome) and answer.held
             left = order.done(ask, Code(answer.code), answer.message, *self._ends, touched=touched, held=held)
             self._seconds += trial.sim_s
+            if ask.phase == "aside":
+                continue
             if answer.success:
                 placed.append(trial)
                 continue

@@ -22,8 +22,6 @@ from openarm_grasp.evidence.verdicts import CameraVerdict
 
 #: A thing that rests as it rested is as high as before, m, or to this share of its height.
 _HEIGHT, _HEIGHT_SHARE = 0.008, 0.08
-#: What rests so much lower than it was let go has fallen, m.
-_FELL = 0.015
 #: Its largest horizontal extent is as before, m, or to this share of it: another view sees other sides.
 _EXTENT, _EXTENT_SHARE = 0.015, 0.25
 #: A cluster with a smaller share of the points of the thing is a remainder of something else.
@@ -245,7 +243,7 @@ def judge_rests(
         p_expected: (2,) or (3,) where its centroid should be, base frame, m; z is not read.
         frames: Taken after the arm has left; the newest that shows it counts.
         tolerance: Largest horizontal distance, m.
-        leaned: It may have lain on something else: it may be a little lower now, and look longer.
+        leaned: It may have lain on something else: it may be lower now, and look longer.
     """
     if not frames:
         return CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
@@ -273,9 +271,6 @@ def _compare(before: Cluster, now: Cluster, p_expected: Array, tolerance: float,
         return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
     stood = before.top - _floor(before)
     higher = now.top - before.top
-    if leaned and higher < -_FELL:
-        fell = f"it rests {-higher * 1e3:.0f} mm lower than it did, as it had lain on something: it has fallen"
-        return CameraVerdict(Code.PLACE_FAILED, fell)
     if abs(higher) > max(_HEIGHT, _HEIGHT_SHARE * stood) and not (leaned and higher < 0.0):
         was = f"it is {abs(higher) * 1e3:.0f} mm {'higher' if higher > 0.0 else 'lower'} than it was"
         return CameraVerdict(Code.PLACE_FAILED, f"the object does not rest as it did: {was}", final=True)

@@ -59,8 +59,8 @@ class Sweep:
     rest: tuple[Detection, ...]
 
 
-def sweeps(found: Sighting, hand: Array, context: GraspContext) -> tuple[Sweep, ...]:
-    """Find lines that push an object away from what stands close to it, those that move the least else first.
+def sweeps(found: Sighting, hand: Array, context: GraspContext, lengths: Sequence[float]) -> tuple[Sweep, ...]:
+    """Find lines that push an object away from where it stands, those that move the least else first.
 
     A line begins behind the object, or behind what touches it there. Pushing along such lines makes room for grasps
     in heaps (Danielczuk et al., "Linear push policies to increase grasp access for robot bin picking", CASE 2018).
@@ -69,6 +69,7 @@ def sweeps(found: Sighting, hand: Array, context: GraspContext) -> tuple[Sweep, 
         found: The object and its neighbours.
         hand: Points (n, 3) of the closed hand, TCP frame.
         context: Parameters and table.
+        lengths: Of the way of the object, m.
     """
     config, floor = context.config, context.table.top_z
     things, around = [_standing(object_points(found.clouds), found.target, floor)], points_around(found.clouds)
@@ -77,7 +78,7 @@ def sweeps(found: Sighting, hand: Array, context: GraspContext) -> tuple[Sweep, 
     room = 2.0 * (half + config.push.gap)
     crowd = np.concatenate(things)[:, :2].mean(axis=0)
     ways: list[tuple[int, float, Sweep]] = []
-    for length, k in product(config.push.lengths, range(config.push.directions)):
+    for length, k in product(lengths, range(config.push.directions)):
         R = se3.rot_z(2.0 * pi * k / config.push.directions)
         line = _line([thing @ R for thing in things], half, room, length)
         if line is None:

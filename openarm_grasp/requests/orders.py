@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from openarm_common.config import Config, Interval, load_config
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.wanted import EASIEST
+from openarm_common.wanted import EASIEST, takes_all
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.request import GraspRequest
 
@@ -28,12 +28,16 @@ Spot = tuple[float, float]
 _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 #: There is no more of it in view.
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
+#: What is refused so may lie on others, or keep a hand from them.
+_IN_THE_WAY = (Code.TOO_WIDE, Code.IN_COLLISION)
 #: With these the camera had not shown enough yet: another look may.
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
 #: Requests in vain, one after the other, until a label is given up: that saw nothing, and that moved an arm.
 _UNSEEN, _IN_VAIN = 3, 10
 #: Things that are asked for by their places at most, while nothing moves.
 _MOST = 10
+#: Things that are pushed aside at most, one after the other in vain.
+_PUSHES = 3
 #: What is left so near to where something was left before is that, m.
 _SAME_SPOT = 0.02
 
@@ -115,7 +119,8 @@ class Order:
     In a round everything in view is asked for once. What cannot be taken is left, and asked for in another round when
     an arm has moved anything since: it may have been in the way, or have hidden it, or lie otherwise itself. After a
     round in which nothing has moved, each thing is asked for by where it is: what stands close to it may be pushed
-    aside then. The order ends when nothing is left, when nothing moves any more, or when all that moves does so in
+    aside then. Where whatever there is is wanted, what no hand takes is pushed aside itself at last, since things may
+    lie below it. The order ends when nothing is left, when nothing moves any more, or when all that moves does so in
     vain.
 
     Attributes:
@@ -141,6 +146,8 @@ class Order:
     _before: list[Left] = field(default_factory=list[Left])
     #: Places that things were asked for by in this round.
     _by_place: list[Spot] = field(default_factory=list[Spot])
+    #: Places of what was pushed aside since the newest success.
+    _pushed: list[Spot] = field(default_factory=list[Spot])
     #: Requests after which things lay, or were seen, otherwise; since the newest success, how many moved something in
     #: vain, saw nothing, or did not see a thing at its place.
     _moved: int = 0
@@ -180,11 +187,19 @@ class Order:
         if any(one.after < self._moved for one in left):
             self._before, self.left, self._asked, self._by_place = self.left, [], set(), []
             return self.next()
+        stay = tuple(self._stand)
         for one in left:
             if one.where is not None and one.code in (*NO_WAY, *_GONE) and not self._was_asked_for(one.where):
-                stay, spots = tuple(self._stand), self._spots(one.label)
+                spots = self._spots(one.label)
                 return GraspRequest(one.label, object_at=one.where, exclude_near=stay, place_choices=spots)
+        for one in left:
+            if one.where is not None and one.code in _IN_THE_WAY and self._may_push(one.label, one.where):
+                return GraspRequest(one.label, object_at=one.where, exclude_near=stay, phase="aside")
         return None
+
+    def _may_push(self, label: str, where: Spot) -> bool:
+        known = any(math.dist(where, spot) < _SAME_SPOT for spot in self._pushed)
+        return takes_all(label) and len(self._pushed) < _PUSHES and not known
 
     def _enough(self, label: str) -> bool:
         most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
@@ -229,6 +244,10 @@ class Order:
             held: A hand may hold it still: it is put down before anything else; one that cannot do that ends the label.
         """
         label, after = self.label_of(request), self._moved
+        if request.phase == "aside" and request.object_at is not None and code not in _OVER:
+            self._pushed.append((float(request.object_at[0]), float(request.object_at[1])))
+            self._moved += touched
+            return None
         self.left = [one for one in self.left if one.label != label or one.where is not None]
         placing = request.phase == "place"
         self._held = label if held and not placing else ""
@@ -265,7 +284,7 @@ class Order:
         """Note that an object of a label was placed."""
         if placing and self.left:
             self.left.pop()  # what was left in the hand
-        self._in_vain, self._unseen, self._otherwise, self._before = 0, 0, 0, []
+        self._in_vain, self._unseen, self._otherwise, self._before, self._pushed = 0, 0, 0, [], []
         self.placed.append(label)
         if len(placed) >= 2:
             self._stand.append((float(placed[0]), float(placed[1])))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from openarm_grasp.planning.options import Option
 
 #: What a request may ask for.
-PHASES = ("all", "pick", "place")
+PHASES = ("all", "pick", "place", "aside")
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class GraspRequest:
         place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
         dry_run: Plan and report, do not move.
         confirm: Show each plan, and execute it when a person has confirmed it.
-        phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
+        phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds; "aside": push the
+            object away from where it is, so that what it hides or blocks comes free.
         place_yaw: Of the object's x axis about the base z, rad (half a turn makes no difference); None: unconstrained.
         timeout: s of robot time for all of it; 0: none.
         object_at: (x, y) near which the object is, base frame, m; None: any that is called so.
@@ -142,6 +143,17 @@ class Feasible:
 
 
 @dataclass(frozen=True)
+class PushedAside:
+    """Why a request for phase aside counts as done.
+
+    Attributes:
+        camera: That the object is seen elsewhere than before.
+    """
+
+    camera: CameraVerdict
+
+
+@dataclass(frozen=True)
 class GraspOutcome:
     """The answer to a request.
 
@@ -181,7 +193,7 @@ class GraspOutcome:
     options: tuple[Option, ...] = ()
     state_times: tuple[StateTime, ...] = ()
     recording: str = ""
-    proof: Proof | Feasible | None = None
+    proof: Proof | Feasible | PushedAside | None = None
 
     def __post_init__(self) -> None:
         if self.code is Code.OK and (self.proof is None or (isinstance(self.proof, Feasible) and self.attempts > 0)):

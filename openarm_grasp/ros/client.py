@@ -129,7 +129,8 @@ class GraspClient(BackgroundNode):
             object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
             exclude_near: (x, y) of objects that stay where they are.
             place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
-            phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
+            phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds;
+                "aside": push the object away from where it is.
             dry_run: Plan and report, do not move.
             confirm: Called in the thread of the caller with the `GraspStatus` of each plan that waits (its `plan_id`,
                 `arm`, and `reason` in a sentence); whether that plan is executed. True: plans wait for somebody else,

@@ -38,8 +38,8 @@ from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.planning.place import place_targets, placing_error
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
-from openarm_grasp.requests.states import Hand, State, check_transition
-from openarm_grasp.requests.task import Grasp, Placed, Status, Task
+from openarm_grasp.requests.states import Hand, State
+from openarm_grasp.requests.task import Grasp, Placed, Task
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
 from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place, regrasped
@@ -95,10 +95,7 @@ async def pick_and_place(task: Task, request: GraspRequest) -> GraspOutcome:
     elif not run.holding and not request.dry_run:
         session.kept.pop(run.arm, None)
     task.outcome, task.findings, task.attempts = outcome, run.findings, max(task.attempts, outcome.attempts)
-    check_transition(run.state, State.IDLE)
-    about = Status(State.IDLE, run.state, outcome.message, label=outcome.label, arm=outcome.arm, request=task.index)
-    task.report(replace(about, code=outcome.code.value))
-    return outcome
+    return run.end(outcome)
 
 
 async def _attempts(run: Run) -> GraspOutcome:
@@ -463,12 +460,13 @@ def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame
     T_base_now = placed.target.T_base_tcp @ se3.inverse(grasp.candidate.T_base_tcp)
     rests = se3.apply(T_base_now, before.centroid)
     now, points = nearest_to(frames, rests if before.cut else place)
-    if before.cut:
-        seen = judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
-    else:
+    seen = judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
+    if not before.cut:
+        # next to others it may have been several things, or have lain on one: such come apart, or fall
         leaned = any(gap(d, grasp.sighting.target) < NEXT_TO for d in grasp.sighting.others)
         tolerance = _SEEN_WITHIN * config.place.tolerance
-        seen = judge_rests(before, rests, cluster_frames(frames, rests), tolerance, leaned=leaned)
+        rested = judge_rests(before, rests, cluster_frames(frames, rests), tolerance, leaned=leaned)
+        seen = seen if leaned and rested.ok else rested
     torn = next((d for d in grasp.adjacent if not before.cut and not stands(d, frames)), None)
     if seen.ok and torn is not None:
         x, y = torn.p_base[:2]

@@ -18,11 +18,12 @@ from itertools import islice
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_common.wanted import EASIEST
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.detections import Sighting, apart
 from openarm_grasp.perception.sightings import seen_at
 from openarm_grasp.planning.candidates import GraspCandidate, displaced
 from openarm_grasp.planning.feasibility import FeasibilityCheck
@@ -41,8 +42,8 @@ from openarm_grasp.strategies.pick_and_place import pick_and_place
 _SWEEPS = 10
 #: Turns of a hand that meets things of any shape, deg.
 _TURNS = (0.0, 30.0, -30.0)
-#: What a push moves less than this, m, is not pushed again in directions that near (cosine) to it.
-_MOVES, _SAME_WAY = 0.01, 0.5
+#: What moves by a smaller share of a push than this is not pushed again in directions that near (cosine) to it.
+_FOLLOWS, _SAME_WAY = 1.0 / 3.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,10 @@ class Push:
         """(2,) direction."""
         return direction(self.end - self.start)
 
+    def moves(self, before: Detection, after: Detection) -> bool:
+        """Whether the object went along, and did not stay or slide past the hand."""
+        return apart(before, after) >= _FOLLOWS * float(np.linalg.norm(self.end - self.start))
+
 
 async def push(task: Task) -> GraspOutcome | None:
     """Push an object that no arm can grasp where it is into reach, observe, and pick it; several times if need be."""
@@ -97,17 +102,13 @@ async def push(task: Task) -> GraspOutcome | None:
             return replace(refused, message=f"{refused.message}; after {number - 1} pushes {error.message}")
         if task.request.dry_run:
             return replace(refused, code=Code.OK, message=f"can be done: {planned}", proof=Feasible(str(planned)))
-        standing = (found.target, *found.others)
-        changed = await agree(task, planned.arm, str(planned), [(PUSH, planned.plan)], task.note, standing)
-        if changed:
-            raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning again')}; ask again")
-        task.attempts = max(task.attempts, 1)
+        await agree_to_push(task, planned, found)
         try:
             pushed, observed = await carry_out_push(task, planned, found, number)
         except OpenArmError as error:
             return replace(refused, code=error.code, message=error.message)
         task.displaced = "after the pushes"
-        if np.linalg.norm(pushed.target.p_base[:2] - planned.start) < _MOVES:
+        if not planned.moves(found.target, pushed.target):
             blocked.append(planned.ahead)
         refused = await pick_and_place(task, replace(task.request.about(pushed), why=observed))
         if refused.success:
@@ -157,7 +158,7 @@ async def _plan(task: Task, found: Sighting, blocked: Sequence[Array]) -> Push:
                 raise
             fault = f"{error.message}; "
     try:
-        return await plan_sweep(task, found, blocked)
+        return await plan_sweep(task, found, blocked, task.context.config.push.lengths)
     except OpenArmError as error:
         raise OpenArmError(error.code, f"{fault}{error.message}") from error
 
@@ -238,8 +239,14 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
     raise OpenArmError(Code.UNREACHABLE, f"no hand comes behind it: {'; '.join(faults)}")
 
 
-async def plan_sweep(task: Task, found: Sighting, blocked: Sequence[Array]) -> Push:
-    """Find a line through the crowd that an object stands in; arguments as `_plan`.
+async def plan_sweep(task: Task, found: Sighting, blocked: Sequence[Array], lengths: Sequence[float]) -> Push:
+    """Find a line that pushes an object along with what it meets.
+
+    Args:
+        task: That it is a part of.
+        found: The object and its neighbours.
+        blocked: (2,) directions in which a push did not move it.
+        lengths: Of its way, m.
 
     Raises:
         OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
@@ -248,7 +255,7 @@ async def plan_sweep(task: Task, found: Sighting, blocked: Sequence[Array]) -> P
     start = found.target.p_base[:2]
     for arm in context.arm_order("auto", float(start[1])):
         hand = closed_hand(robot.description, arm)
-        lines = (one for one in sweeps(found, hand, context) if _is_open(one.freed - start, blocked))
+        lines = (one for one in sweeps(found, hand, context, lengths) if _is_open(one.freed - start, blocked))
         for sweep in islice(lines, _SWEEPS):
             ways = push_ways(sweep.met, sweep.end, context.config, hand, context.hand, _TURNS)
             if not ways:
@@ -266,6 +273,18 @@ async def plan_sweep(task: Task, found: Sighting, blocked: Sequence[Array]) -> P
     raise OpenArmError(Code.UNREACHABLE, f"nor can it be pushed out of what is near it: {why}")
 
 
+async def agree_to_push(task: Task, planned: Push, found: Sighting) -> None:
+    """Let a person confirm a push, where that is asked for.
+
+    Raises:
+        OpenArmError: STALE_DATA, when the scene has changed meanwhile; CANCELLED, when it is rejected.
+    """
+    standing = (found.target, *found.others)
+    changed = await agree(task, planned.arm, str(planned), [(PUSH, planned.plan)], task.note, standing)
+    if changed:
+        raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning again')}; ask again")
+
+
 async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int) -> tuple[Sighting, str]:
     """Push, go home and observe; returns the object as it was observed, and a sentence.
 
@@ -280,6 +299,7 @@ async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int
             object is not seen any more.
     """
     config, robot, arm, way = task.context.config, task.robot, planned.arm, planned.way
+    task.attempts = max(task.attempts, 1)
     task.note(f"push {number} of at most {config.push.most}: {planned}")
     T_base_back, fault, short = way.T_base_tcp, None, ""
     try:

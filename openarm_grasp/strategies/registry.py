@@ -16,6 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.request import GraspOutcome, PairOutcome
 from openarm_grasp.requests.task import Task
+from openarm_grasp.strategies.aside import aside
 from openarm_grasp.strategies.direct import direct
 from openarm_grasp.strategies.hand_over import hand_over
 from openarm_grasp.strategies.height import height
@@ -32,6 +33,8 @@ STRATEGIES: dict[str, Strategy] = {
     "push": push,
     "hand_over": hand_over,
 }
+#: For phase aside: nothing is grasped.
+ASIDE: dict[str, Strategy] = {"aside": aside}
 
 
 async def carry_out(task: Task) -> GraspOutcome:
@@ -41,7 +44,7 @@ async def carry_out(task: Task) -> GraspOutcome:
         OpenArmError: INVALID_ARGUMENT or NOT_READY, when the request is not taken.
     """
     await take_up(task.session, task.robot, task.request)
-    for route, strategy in STRATEGIES.items():
+    for route, strategy in (ASIDE if task.request.phase == "aside" else STRATEGIES).items():
         try:
             outcome = await strategy(task)
         except OpenArmError as error:

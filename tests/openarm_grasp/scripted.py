@@ -114,6 +114,7 @@ class World(Skills):
         scene, q: Version of the planning scene, joints.
         near_off: How far off the camera on the hand sees objects, m.
         followed: Trajectories, in their order.
+        lines: (3,) of pushes that were planned, m.
         far: The arms grasp nothing that is further away than this, m; a hand may push it from there.
         follows: Share of a push that the object follows.
     """
@@ -134,6 +135,7 @@ class World(Skills):
         self.two_sided = False
         self.scene, self.q, self.near_off = 1, {"right_joint1": 0.0, "left_joint1": 0.0}, 0.0
         self.followed: list[object] = []
+        self.lines: list[np.ndarray] = []
         self.stopped: Code | None = None
         self.on_report: Callable[[Status], None] = lambda status: None
         self.plans: list[Planned | OpenArmError] = []
@@ -234,6 +236,7 @@ class World(Skills):
             if not self.hands_come_behind:
                 raise OpenArmError(Code.UNREACHABLE, f"{request.arm} arm: too far")
             self._line, self._label = request.candidates[0].retreat_offset, ""
+            self.lines.append(self._line)
             return self._planned(0, "transfer", "behind", "push")
         self.call(request)
         if self.plans:

@@ -38,17 +38,23 @@ def labels(order: Order, asked: list[GraspRequest]) -> list[str]:
 
 
 class Heap:
-    """Objects at places, of which some lie under others: those can be taken when nothing is over them."""
+    """Objects at places, of which some lie under others: those can be taken when nothing is over them.
 
-    def __init__(self, places: dict[str, tuple[float, float]], under: dict[str, str], never: tuple[str, ...] = ()):
+    What is pushed aside moves by 20 cm, and hides nothing more, where it is one of `yields`.
+    """
+
+    def __init__(self, places: dict[str, tuple[float, float]], under: dict[str, str], never: tuple[str, ...] = (),
+                 hidden: dict[str, str] | None = None, yields: tuple[str, ...] = ()):  # fmt: skip
         self.places, self.under, self.never, self.taken = dict(places), under, never, list[str]()
+        self.hidden, self.yields, self.aside = hidden or {}, yields, list[str]()
 
     def clear(self, order: Order) -> int:
         asked = 0
         while ask := order.next():
             asked += 1
             assert asked < 100
-            there = [n for n, at in self.places.items() if all(np.hypot(*np.subtract(at, p)) > 0.05
+            in_view = {n: at for n, at in self.places.items() if n not in self.hidden}
+            there = [n for n, at in in_view.items() if all(np.hypot(*np.subtract(at, p)) > 0.05
                                                                for p in ask.exclude_near)]  # fmt: skip
             if ask.object_at is not None:
                 there = [n for n in there if self.places[n] == ask.object_at]
@@ -56,6 +62,14 @@ class Heap:
                 order.done(ask, Code.UNKNOWN_OBJECT, "no more")
                 continue
             name = there[0]
+            if ask.phase == "aside":
+                self.aside.append(name)
+                if name in self.yields:
+                    self.places[name] = (self.places[name][0], self.places[name][1] + 0.2)
+                    self.hidden = {n: by for n, by in self.hidden.items() if by != name}
+                code = Code.OK if name in self.yields else Code.UNREACHABLE
+                order.done(ask, code, "", seen=(*self.places[name], 0.4), touched=name in self.yields)
+                continue
             if name in self.never or self.under.get(name) in self.places:
                 order.done(ask, Code.IN_COLLISION, f"{name} has no room", seen=(*self.places[name], 0.4))
                 continue
@@ -82,10 +96,26 @@ def test_what_cannot_be_taken_is_listed_with_place_and_reason():
     heap, order = Heap(HEAP, {}, never=("middle", "lowest")), Order(("anything",))
     asked = heap.clear(order)
     assert heap.taken == ["top"]
-    assert asked == 9  # two in vain, one taken, none more; both again, none more; each by its place
+    assert asked == 11  # two in vain, one taken, none more; both again, none more; each by its place; each aside
     assert order.outcome == "PARTIAL"
     assert {one.where: one.code for one in order.left} == {HEAP[n]: Code.IN_COLLISION for n in ("lowest", "middle")}
     assert "anything at (0.200, 0.000) m: IN_COLLISION: lowest has no room" in order.faults()
+
+
+@pytest.mark.requirement("R-17")
+def test_what_no_hand_takes_is_pushed_aside_for_what_it_hides():
+    heap = Heap(HEAP, {}, never=("top",), hidden={"lowest": "top", "middle": "top"}, yields=("top",))
+    order = Order(("anything",))
+    heap.clear(order)
+    assert heap.taken == ["lowest", "middle"]
+    assert heap.aside.count("top") == 1 + 3  # uncovers both; then in vain, until it is given up
+    assert [one.where for one in order.left] == [heap.places["top"]]
+
+
+def test_nothing_is_pushed_aside_for_an_order_of_something_particular():
+    heap, order = Heap(HEAP, {}, never=("top",), yields=("top",)), Order(("red",))
+    heap.clear(order)
+    assert heap.aside == []
 
 
 def test_of_all_that_fits_the_easiest_is_asked_for():

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -50,11 +51,13 @@ def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_obj
 
 
 @pytest.mark.requirement("N-13")
-def test_a_push_that_the_object_does_not_follow_is_repeated_three_times_and_reported(robot) -> None:
+def test_a_push_that_the_object_does_not_follow_goes_another_way_next_and_is_reported(robot) -> None:
     two = robot(0.46, 0.02)
     two.far, two.follows = 0.44, 0.1
     outcome = two.ask()
-    assert two.pushed == 3
+    assert two.pushed == 2  # no third way leads into reach
+    first, second = (line[:2] / np.linalg.norm(line[:2]) for line in (two.lines[0], two.lines[-1]))
+    assert first @ second < 0.5
     assert (outcome.kind, outcome.code, outcome.route) == ("PARTIAL", Code.UNREACHABLE, "")
     x, y, _ = two.objects["red"].p_base
     assert f"after the pushes 'red' was seen at ({x:.3f}, {y:.3f}) m" in outcome.message
@@ -125,3 +128,33 @@ def test_a_dry_run_of_a_push_moves_nothing(robot) -> None:
     outcome = two.ask(dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "push")
     assert not two.done(Follow)
+
+
+@pytest.mark.requirement("R-17")
+def test_an_object_is_pushed_aside_as_far_as_a_push_goes_and_not_picked(robot) -> None:
+    two = robot(0.30, 0.2)
+    before = two.objects["red"].p_base
+    outcome = two.ask("red", phase="aside")
+    assert (outcome.code, outcome.kind, outcome.route) == (Code.OK, "SUCCESS", "aside"), outcome.message
+    assert two.pushed == 1
+    assert np.linalg.norm(two.objects["red"].p_base - before) == pytest.approx(GraspConfig().push.aside[0], abs=1e-3)
+    assert "aside" in " ".join(two.notes)
+    assert not [e for e in two.done(PlanPlace)]
+
+
+def test_what_does_not_move_aside_is_pushed_in_other_directions_and_reported(robot) -> None:
+    two = robot(0.30, 0.2)
+    two.follows = 0.0
+    outcome = two.ask("red", phase="aside")
+    assert outcome.code is Code.PLACE_FAILED
+    assert two.pushed == GraspConfig().push.most
+    assert "does not move aside" in outcome.message
+    ways = [line[:2] for line in two.lines]
+    assert all(a @ b < 0.5 * np.linalg.norm(a) * np.linalg.norm(b) for a, b in itertools.combinations(ways, 2))
+
+
+def test_a_dry_run_of_a_push_aside_moves_nothing(robot) -> None:
+    two = robot(0.30, 0.2)
+    outcome = two.ask("red", phase="aside", dry_run=True)
+    assert (outcome.code, two.pushed) == (Code.OK, 0)
+    assert outcome.message.startswith("can be done: the ")

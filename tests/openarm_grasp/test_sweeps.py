@@ -21,6 +21,7 @@ from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from tests.openarm_grasp.scripted import HAND, Follow, World, robot_work, standing
 
 CONFIG = GraspConfig()
+LENGTHS = CONFIG.push.lengths
 CONTEXT = GraspContext(CONFIG, robot_work().table, HAND, {"left": (0.0, 0.15), "right": (0.0, -0.15)})
 
 
@@ -42,16 +43,16 @@ ROW = crowd(standing("red", 0.26, 0.2), standing("blue", 0.26, 0.255), standing(
 
 @pytest.mark.requirement("R-17")
 def test_out_of_a_row_an_object_is_pushed_across_it():
-    first, *others = sweeps(ROW, hand(), CONTEXT)
+    first, *others = sweeps(ROW, hand(), CONTEXT, LENGTHS)
     assert abs(ahead(first)[0]) == pytest.approx(1.0, abs=1e-6)
     assert first.rest == ROW.others
-    assert np.linalg.norm(first.freed - ROW.target.p_base[:2]) == pytest.approx(CONFIG.push.lengths[0])
+    assert np.linalg.norm(first.freed - ROW.target.p_base[:2]) == pytest.approx(LENGTHS[0])
     along = [one for one in others if abs(ahead(one)[1]) > 0.99]  # with what is ahead, or comes before it
     assert all(len(one.rest) < 2 for one in along)
 
 
 def test_a_line_begins_behind_all_that_the_hand_has_no_room_beside():
-    along = next(one for one in sweeps(ROW, hand(), CONTEXT) if ahead(one)[1] > 0.99)
+    along = next(one for one in sweeps(ROW, hand(), CONTEXT, LENGTHS) if ahead(one)[1] > 0.99)
     begin = along.met.p_base[1] - 0.5 * along.met.size[0]
     assert begin == pytest.approx(0.12, abs=0.01)  # the far side of the first of the row
     assert along.rest == ()
@@ -62,7 +63,7 @@ def test_a_line_begins_behind_all_that_the_hand_has_no_room_beside():
 
 
 def test_boxes_about_what_is_moved_stand_clear_of_the_table_and_hold_all_of_it():
-    for sweep in sweeps(ROW, hand(), CONTEXT):
+    for sweep in sweeps(ROW, hand(), CONTEXT, LENGTHS):
         moved = [one for one in (ROW.target, *ROW.others) if one not in sweep.rest]
         for box in sweep.heap:
             assert box.T_frame_box[2, 3] - 0.5 * box.size[2] >= CONTEXT.table.top_z + 0.5 * CONFIG.approach.table_gap
@@ -74,10 +75,10 @@ def test_boxes_about_what_is_moved_stand_clear_of_the_table_and_hold_all_of_it()
 def test_nothing_is_pushed_off_the_table_or_away_from_the_arms():
     x, y = CONTEXT.table.x[0] + 0.03, 0.2
     edge = crowd(standing("red", x, y), standing("blue", x, y + 0.055))
-    assert all(ahead(one)[0] > -1e-6 for one in sweeps(edge, hand(), CONTEXT))
+    assert all(ahead(one)[0] > -1e-6 for one in sweeps(edge, hand(), CONTEXT, LENGTHS))
     far = CONTEXT.config.place.region_x[1] + 0.05
     beyond = crowd(standing("red", far, y), standing("blue", far, y + 0.055))
-    assert all(ahead(one)[0] < 1e-6 for one in sweeps(beyond, hand(), CONTEXT))
+    assert all(ahead(one)[0] < 1e-6 for one in sweeps(beyond, hand(), CONTEXT, LENGTHS))
 
 
 def test_a_crowd_is_what_stands_within_a_finger():
@@ -144,5 +145,5 @@ def test_a_push_that_is_blocked_is_observed_all_the_same(robot) -> None:
 def test_a_thin_heap_is_not_swept() -> None:
     flat = [replace(one, size=np.array([*one.size[:2], 0.004])) for one in (ROW.target, *ROW.others)]
     flat = [replace(one, T_base_object=se3.make(p=(*one.p_base[:2], 0.402))) for one in flat]
-    for sweep in sweeps(crowd(*flat), hand(), CONTEXT):
+    for sweep in sweeps(crowd(*flat), hand(), CONTEXT, LENGTHS):
         assert push_ways(sweep.met, sweep.end, CONFIG, hand(), HAND) == ()

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Push an object away from where it is, whether a hand can grasp it or not: what it hides or blocks comes free.
+
+A plate that no hand can close on may lie on a spoon. The longest line that can be planned is taken, with all that the
+hand meets on it; the camera says how far the object has moved. Base frame, m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
+from openarm_grasp.evidence.verdicts import CameraVerdict
+from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.requests.request import Feasible, GraspOutcome, PushedAside
+from openarm_grasp.requests.task import Task
+from openarm_grasp.strategies.find import detect
+from openarm_grasp.strategies.push import Push, agree_to_push, carry_out_push, plan_sweep
+from openarm_grasp.strategies.run import Run
+
+
+async def aside(task: Task) -> GraspOutcome:
+    """Push an object aside; in other directions, where it does not move."""
+    request, robot = task.in_time(task.request), task.robot
+    task.session.check_hands(robot, request)
+    request.check(robot.description.arm_names)
+    run = Run(task, request, None)
+    robot.set_deadline(request.timeout)
+    try:
+        found = await detect(run, f"asked to push {request.label or 'any object'!r} aside")
+        outcome = await _pushed(run, found)
+    except OpenArmError as error:
+        outcome = run.answer(error.code, error.message)
+    return run.end(outcome)
+
+
+async def _pushed(run: Run, found: Sighting) -> GraspOutcome:
+    """Push until the object has moved.
+
+    Raises:
+        OpenArmError: UNREACHABLE, when no push can be planned; what the robot raises.
+    """
+    task, config, blocked, text = run.task, run.config, list[Array](), ""
+    for number in range(1, config.push.most + 1):
+        try:
+            planned = await _planned(task, found, blocked)
+        except OpenArmError as error:
+            if number == 1 or error.code not in NO_WAY:
+                raise
+            raise OpenArmError(Code.PLACE_FAILED, f"{text}; then {error.message}") from error
+        if run.request.dry_run:
+            return run.answer(Code.OK, f"can be done: {planned}", Feasible(str(planned)))
+        await agree_to_push(task, planned, found)
+        run.arm, run.tried = planned.arm, run.tried + 1
+        task.displaced = "after the pushes"
+        pushed, text = await carry_out_push(task, planned, found, number)
+        run.seen_at = pushed.target.p_base
+        task.findings.sighting = run.findings.sighting = pushed
+        if planned.moves(found.target, pushed.target):
+            return run.answer(Code.OK, text, PushedAside(CameraVerdict(Code.OK, text)))
+        blocked.append(planned.ahead)
+        found = pushed
+    raise OpenArmError(Code.PLACE_FAILED, f"{text}; it does not move aside")
+
+
+async def _planned(task: Task, found: Sighting, blocked: list[Array]) -> Push:
+    """The longest push that can be planned, "aside" in its reason."""
+    fault: OpenArmError | None = None
+    for length in task.context.config.push.aside:
+        try:
+            return replace(await plan_sweep(task, found, blocked, (length,)), why="aside")
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            fault = fault or error
+    raise fault or OpenArmError(Code.UNREACHABLE, "no length of a push aside is allowed; see push.aside")
