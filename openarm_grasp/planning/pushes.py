@@ -36,6 +36,8 @@ _TIPS = 0.03
 _ROW, _MEET = 0.006, 0.004
 #: Things are not pushed farther than this beyond where arms reach, and no farther than this at once, m.
 _BEYOND, _LONGEST = 0.05, 0.30
+#: Share of a line by which what stands where no arm reaches must come nearer to there.
+_COMES = 0.5
 #: A line away from the middle of the crowd may be so much longer, m.
 _OUTWARD = 0.10
 
@@ -86,6 +88,8 @@ def sweeps(found: Sighting, hand: Array, context: GraspContext, lengths: Sequenc
         begin, near, far, moved = line
         cells, whole, ahead = np.concatenate([things[i] for i in moved]), near - begin + length, R[:2, 0]
         if whole > _LONGEST or not _allowed(cells[:, :2], whole * ahead, context):
+            continue
+        if not _nearer(found.target.p_base[:2], length * ahead, context):
             continue
         aside = float(np.median(things[0] @ R[:, 1]))
         local = cells @ R
@@ -156,15 +160,23 @@ def _line(
 
 def _allowed(xy: Array, step: Array, context: GraspContext) -> bool:
     """Whether all of (n, 2) stays on the table, and about where arms reach, or comes nearer to there."""
+    return bool((_outside(xy + step, context, _BEYOND) <= _outside(xy, context, _BEYOND)).all())
+
+
+def _nearer(xy: Array, step: Array, context: GraspContext) -> bool:
+    """Whether what stands (2,) where no arm reaches comes nearer to there; true of what stands elsewhere."""
+    off = float(np.linalg.norm(_outside(xy, context)))
+    after = float(np.linalg.norm(_outside(xy + step, context)))
+    return off == 0.0 or after <= max(off - _COMES * float(np.linalg.norm(step)), 0.0)
+
+
+def _outside(xy: Array, context: GraspContext, beyond: float = 0.0) -> Array:
+    """How far (…, 2) are off the table, or off where arms reach and a margin beyond that, along each axis, m."""
     table, place = context.table, context.config.place
-    side = place.region_abs_y[1] + _BEYOND
-    low = np.maximum([table.x[0], table.y[0]], [place.region_x[0] - _BEYOND, -side])
-    high = np.minimum([table.x[1], table.y[1]], [place.region_x[1] + _BEYOND, side])
-
-    def outside(points: Array) -> Array:
-        return np.maximum(np.maximum(low - points, points - high), 0.0)
-
-    return bool((outside(xy + step) <= outside(xy)).all())
+    side = place.region_abs_y[1] + beyond
+    low = np.maximum([table.x[0], table.y[0]], [place.region_x[0] - beyond, -side])
+    high = np.minimum([table.x[1], table.y[1]], [place.region_x[1] + beyond, side])
+    return np.maximum(np.maximum(low - xy, xy - high), 0.0)
 
 
 def destinations(target: Detection, others: Sequence[Detection], context: GraspContext) -> tuple[Array, ...]:
