@@ -175,7 +175,7 @@ def judge_sight(
                 Code.GRASP_LOST,
                 f"{text}, the hand {lift * 1e3:.0f} mm: it has slipped by at least {slipped * 1e3:.0f} mm, {limit}",
             )
-        off = sticks_out(highest, before)
+        off = sticks_out(highest, before) if highest.measured else 0.0  # a part of it, or of the arm, proves nothing
         if off > config.askew:
             limit = f"expected at most {config.askew * 1e3:.0f} mm"
             return CameraVerdict(

@@ -42,10 +42,10 @@ async def _pushed(run: Run, found: Sighting) -> GraspOutcome:
     Raises:
         OpenArmError: UNREACHABLE, when no push can be planned; what the robot raises.
     """
-    task, config, blocked, text = run.task, run.config, list[Array](), ""
+    task, config, avoid, text = run.task, run.config, list[Array](), ""
     for number in range(1, config.push.most + 1):
         try:
-            planned = await _planned(task, found, blocked)
+            planned = await _planned(task, found, avoid)
         except OpenArmError as error:
             if number == 1 or error.code not in NO_WAY:
                 raise
@@ -60,17 +60,17 @@ async def _pushed(run: Run, found: Sighting) -> GraspOutcome:
         task.findings.sighting = run.findings.sighting = pushed
         if planned.moves(found.target, pushed.target):
             return run.answer(Code.OK, text, PushedAside(CameraVerdict(Code.OK, text)))
-        blocked.append(planned.ahead)
+        avoid.append(planned.ahead)
         found = pushed
     raise OpenArmError(Code.PLACE_FAILED, f"{text}; it does not move aside")
 
 
-async def _planned(task: Task, found: Sighting, blocked: list[Array]) -> Push:
+async def _planned(task: Task, found: Sighting, avoid: list[Array]) -> Push:
     """The longest push that can be planned, "aside" in its reason."""
     fault: OpenArmError | None = None
     for length in task.context.config.push.aside:
         try:
-            return replace(await plan_sweep(task, found, blocked, (length,)), why="aside")
+            return replace(await plan_sweep(task, found, avoid, (length,)), why="aside")
         except OpenArmError as error:
             if error.code not in NO_WAY:
                 raise

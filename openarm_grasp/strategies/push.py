@@ -42,7 +42,7 @@ from openarm_grasp.strategies.pick_and_place import pick_and_place
 _SWEEPS = 10
 #: Turns of a hand that meets things of any shape, deg.
 _TURNS = (0.0, 30.0, -30.0)
-#: What moves by a smaller share of a push than this is not pushed again in directions that near (cosine) to it.
+#: What moves by a smaller share of a push than this has not gone along; directions so near (cosine) are the same.
 _FOLLOWS, _SAME_WAY = 1.0 / 3.0, 0.5
 
 
@@ -89,13 +89,13 @@ async def push(task: Task) -> GraspOutcome | None:
     found = task.findings.need_sighting()
     if _easiest(task) and crowded(found) and not found.target.kind:
         return None  # others may be taken first, after which it may stand alone
-    blocked: list[Array] = []
+    avoid: list[Array] = []
     for number in range(1, task.context.config.push.most + 1):
         found = task.findings.need_sighting()
         if not (found.target.measured or _may_sweep(task, found)):
             return None  # how far it reaches is not known
         try:
-            planned = await _plan(task, found, blocked)
+            planned = await _plan(task, found, avoid)
         except OpenArmError as error:
             if number == 1 or error.code not in NO_WAY:
                 raise
@@ -108,8 +108,7 @@ async def push(task: Task) -> GraspOutcome | None:
         except OpenArmError as error:
             return replace(refused, code=error.code, message=error.message)
         task.displaced = "after the pushes"
-        if not planned.moves(found.target, pushed.target):
-            blocked.append(planned.ahead)
+        avoid.append(-planned.ahead if planned.moves(found.target, pushed.target) else planned.ahead)
         refused = await pick_and_place(task, replace(task.request.about(pushed), why=observed))
         if refused.success:
             return replace(refused, message=f"{refused.message}; {observed}")
@@ -118,9 +117,9 @@ async def push(task: Task) -> GraspOutcome | None:
     return refused
 
 
-def _is_open(way: Array, blocked: Sequence[Array]) -> bool:
-    """Whether (2,) leads elsewhere than the directions in which a push did not move the object."""
-    return all(float(direction(way) @ one) < _SAME_WAY for one in blocked)
+def _is_open(way: Array, avoid: Sequence[Array]) -> bool:
+    """Whether (2,) leads elsewhere than directions to avoid."""
+    return all(float(direction(way) @ one) < _SAME_WAY for one in avoid)
 
 
 def _easiest(task: Task) -> bool:
@@ -138,13 +137,13 @@ def _may_sweep(task: Task, found: Sighting) -> bool:
     return not (task.request.dry_run or _easiest(task)) and (crowded(found) or blocked)
 
 
-async def _plan(task: Task, found: Sighting, blocked: Sequence[Array]) -> Push:
+async def _plan(task: Task, found: Sighting, avoid: Sequence[Array]) -> Push:
     """A push into reach; in a crowd, where there is none, one through it.
 
     Args:
         task: That it is a part of.
         found: The object and its neighbours.
-        blocked: (2,) directions in which a push did not move it.
+        avoid: (2,) directions in which a push did not move it, or from which one has.
 
     Raises:
         OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
@@ -152,18 +151,18 @@ async def _plan(task: Task, found: Sighting, blocked: Sequence[Array]) -> Push:
     fault = ""
     if found.target.measured:
         try:
-            return await plan_push(task, found, blocked)
+            return await plan_push(task, found, avoid)
         except OpenArmError as error:
             if error.code not in NO_WAY or not _may_sweep(task, found):
                 raise
             fault = f"{error.message}; "
     try:
-        return await plan_sweep(task, found, blocked, task.context.config.push.lengths)
+        return await plan_sweep(task, found, avoid, task.context.config.push.lengths)
     except OpenArmError as error:
         raise OpenArmError(error.code, f"{fault}{error.message}") from error
 
 
-async def plan_push(task: Task, found: Sighting, blocked: Sequence[Array]) -> Push:
+async def plan_push(task: Task, found: Sighting, avoid: Sequence[Array]) -> Push:
     """Find a push after which the object can be grasped; arguments as `_plan`.
 
     Raises:
@@ -171,7 +170,7 @@ async def plan_push(task: Task, found: Sighting, blocked: Sequence[Array]) -> Pu
     """
     faults: list[str] = []
     start = found.target.p_base[:2]
-    ends = [end for end in destinations(found.target, found.others, task.context) if _is_open(end - start, blocked)]
+    ends = [end for end in destinations(found.target, found.others, task.context) if _is_open(end - start, avoid)]
     ways = _ways_alone(task.context, found) if ends else {}
     for end in ends:
         x, y = end
@@ -239,13 +238,13 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
     raise OpenArmError(Code.UNREACHABLE, f"no hand comes behind it: {'; '.join(faults)}")
 
 
-async def plan_sweep(task: Task, found: Sighting, blocked: Sequence[Array], lengths: Sequence[float]) -> Push:
+async def plan_sweep(task: Task, found: Sighting, avoid: Sequence[Array], lengths: Sequence[float]) -> Push:
     """Find a line that pushes an object along with what it meets.
 
     Args:
         task: That it is a part of.
         found: The object and its neighbours.
-        blocked: (2,) directions in which a push did not move it.
+        avoid: (2,) directions in which a push did not move it, or from which one has.
         lengths: Of its way, m.
 
     Raises:
@@ -255,7 +254,7 @@ async def plan_sweep(task: Task, found: Sighting, blocked: Sequence[Array], leng
     start = found.target.p_base[:2]
     for arm in context.arm_order("auto", float(start[1])):
         hand = closed_hand(robot.description, arm)
-        lines = (one for one in sweeps(found, hand, context, lengths) if _is_open(one.freed - start, blocked))
+        lines = (one for one in sweeps(found, hand, context, lengths) if _is_open(one.freed - start, avoid))
         for sweep in islice(lines, _SWEEPS):
             ways = push_ways(sweep.met, sweep.end, context.config, hand, context.hand, _TURNS)
             if not ways:

@@ -96,6 +96,7 @@ def test_what_was_held_and_is_not_is_lost(gap, effort):
         ([Frame(1, (seen(x=0.27),))], Code.GRASP_MISSED, "still stands"),
         ([Frame(1, (seen(x=0.36),))], Code.OK, "has left"),
         ([Frame(1, (seen(x=0.28, top=0.56),))], Code.GRASP_MISSED, "out of where"),
+        ([Frame(1, (replace(seen(x=0.28, top=0.56), measured=False),))], Code.OK, "higher"),  # a part of it
         ([Frame(1, ()), Frame(2, (seen(),))], Code.GRASP_MISSED, "still stands"),
         ([Frame(1, (seen(),)), Frame(2, ())], Code.GRASP_MISSED, "still stands"),
     ],
