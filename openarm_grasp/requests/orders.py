@@ -28,6 +28,8 @@ Spot = tuple[float, float]
 _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 #: There is no more of it in view.
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
+#: What is refused so may be taken where others are pushed away from it.
+_BY_PLACE = (*(code for code in NO_WAY if code is not Code.TOO_WIDE), *_GONE)
 #: What is refused so may lie on others, or keep a hand from them.
 _IN_THE_WAY = (Code.TOO_WIDE, Code.IN_COLLISION)
 #: With these the camera had not shown enough yet: another look may.
@@ -189,7 +191,7 @@ class Order:
             return self.next()
         stay = tuple(self._stand)
         for one in left:
-            if one.where is not None and one.code in (*NO_WAY, *_GONE) and not self._was_asked_for(one.where):
+            if one.where is not None and one.code in _BY_PLACE and not self._was_asked_for(one.where):
                 spots = self._spots(one.label)
                 return GraspRequest(one.label, object_at=one.where, exclude_near=stay, place_choices=spots)
         for one in left:

@@ -130,11 +130,12 @@ def _may_sweep(task: Task, found: Sighting) -> bool:
     """Whether the object may be pushed with what the hand meets there; what comes of it is not known beforehand.
 
     It stands in a crowd; or it leaves no room for a hand and has corners, so that it lies badly, or is several things.
-    For the easiest object nothing else is moved.
+    For the easiest object nothing else is moved, and what fits into no hand is pushed in phase aside alone.
     """
-    outcome = task.outcome
-    blocked = outcome is not None and outcome.code is Code.IN_COLLISION and cornered(found)
-    return not (task.request.dry_run or _easiest(task)) and (crowded(found) or blocked)
+    code = None if task.outcome is None else task.outcome.code
+    if task.request.dry_run or _easiest(task) or code is Code.TOO_WIDE:
+        return False
+    return crowded(found) or (code is Code.IN_COLLISION and cornered(found))
 
 
 async def _plan(task: Task, found: Sighting, avoid: Sequence[Array]) -> Push:
