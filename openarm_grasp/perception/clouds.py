@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from openarm_common import se3
@@ -25,6 +27,8 @@ _STOOD, _STANDS = 0.015, 0.025
 _REACH = 0.35
 #: What has risen with a thing is seen this near to where it is then, m; a part is seen so by more than this share.
 _PART, _MOST = 0.008, 0.5
+#: Cells of that edge that touch are nearer than this, cells.
+_NEXT_CELL = 1.8
 #: What stayed of a thing is another one where it was this share of it: of less, its neighbours may be seen there.
 _LEFT = 0.15
 #: A point is free where a ray as near to its own, rad, ends so far behind it, m.
@@ -100,7 +104,7 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
     return points[off > _STOOD]
 
 
-def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_before: Array) -> Sighting:
+def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_before: Array, grip: Array) -> Sighting:
     """Return the thing as what has risen as one body: with what came along, and without what has stayed.
 
     An image does not distinguish things that touch from parts of one thing; a motion does (Katz and Brock,
@@ -111,6 +115,7 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
         sighting: The thing as it stood, and what was around it.
         risen: (n, 3) of `risen_points`.
         T_now_before: (4, 4) how the hand has moved since it took hold.
+        grip: (3,) middle between the pads when it did.
     """
     cloud = next((frame.cloud for frame in reversed(frames) if frame.cloud is not None), None)
     if cloud is None or not len(cloud.points):
@@ -132,8 +137,23 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
     up, down = rose(own) > 0, stays(own)
     left = ~up & (down > 0)
     gone = up | (down < 0)
-    apart = np.count_nonzero(left) >= max(_LEAST_POINTS, _LEFT * len(own)) and np.count_nonzero(gone) >= _LEAST_POINTS
-    return divided(whole, left) if apart else whole
+    if np.count_nonzero(left) < max(_LEAST_POINTS, _LEFT * len(own)) or np.count_nonzero(gone) < _LEAST_POINTS:
+        return whole
+    known = left | gone  # what is hidden belongs to what is nearest to it
+    left[~known] = left[known][KDTree(own[known]).query(own[~known])[1]]
+    # and what was pushed a little is free at its border, too
+    left[~left] = ~_in_one_piece(own[~left], grip)
+    return divided(whole, left)
+
+
+def _in_one_piece(points: Array, start: Array) -> NDArray[np.bool_]:
+    """Which of the points (n, 3) are in one piece with that which is nearest to `start`."""
+    cells, cell = np.unique(np.floor(points / _PART).astype(np.int64), axis=0, return_inverse=True)
+    pairs = KDTree(cells).query_pairs(_NEXT_CELL, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
+    _, piece = connected_components(graph, directed=False)
+    piece = piece[cell.ravel()]
+    return np.asarray(piece == piece[np.linalg.norm(points - start, axis=1).argmin()])
 
 
 def _is_part(

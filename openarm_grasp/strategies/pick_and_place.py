@@ -303,8 +303,9 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
     gripper = grasp.judge(evidence, config.held, was_held=True)
     if grasp.of_cloud:
         T, points = robot.T_base_tcp(arm), risen_points(frames, sighting, config.held.rise)
-        moved = T @ se3.inverse(grasp.candidate.T_base_tcp)
-        thing = lifted(frames, sighting, points, moved)
+        T_before = grasp.candidate.T_base_tcp
+        moved = T @ se3.inverse(T_before)
+        thing = lifted(frames, sighting, points, moved, T_before[:3, 3])
         if thing is not sighting:
             grasp = run.grasp = regrasped(run, grasp, thing)
         place, radius = thing.target.p_base, config.detect.match_radius

@@ -221,6 +221,7 @@ def test_what_came_next_to_a_placed_thing_may_be_a_part_of_it():
 
 
 OVER = np.array([0.5, 0.0, 1.1])
+GRIP = np.array([0.27, -0.20, 0.43])
 HANDLE, HEAD, NEIGHBOUR = slab(0.27, -0.20), slab(0.35, -0.20, half=(0.02, 0.03)), slab(0.27, -0.15, half=(0.05, 0.01))
 
 
@@ -260,16 +261,16 @@ def test_what_rises_with_a_thing_as_one_body_is_a_part_of_it():
     found = in_two()
     T = se3.make(se3.rot_z(0.05), (0.0, 0.0, 0.12))
     risen = se3.apply(T, np.concatenate([HANDLE, HEAD]))
-    whole = lifted(seen(risen, NEIGHBOUR), found, risen, T)
+    whole = lifted(seen(risen, NEIGHBOUR), found, risen, T, GRIP)
     assert whole.others == (found.others[1],)
     assert len(object_points(whole.clouds)) == len(HANDLE) + len(HEAD)
     alone = se3.apply(T, HANDLE)
-    assert lifted(seen(alone, HEAD, NEIGHBOUR), found, alone, T) is found
-    assert lifted(seen(risen, HEAD, NEIGHBOUR), found, risen, T) is found  # its like still lies there
-    assert lifted([Frame(1, ())], found, risen, T) is found
+    assert lifted(seen(alone, HEAD, NEIGHBOUR), found, alone, T, GRIP) is found
+    assert lifted(seen(risen, HEAD, NEIGHBOUR), found, risen, T, GRIP) is found  # its like still lies there
+    assert lifted([Frame(1, ())], found, risen, T, GRIP) is found
     blind = LabelledCloud(np.empty((0, 3), np.float32), np.empty(0, np.uint32), OVER)
-    assert lifted([Frame(1, (), blind)], found, risen, T) is found
-    assert lifted(seen(NEIGHBOUR), found, risen[:0], T) is found
+    assert lifted([Frame(1, (), blind)], found, risen, T, GRIP) is found
+    assert lifted(seen(NEIGHBOUR), found, risen[:0], T, GRIP) is found
 
 
 @pytest.mark.requirement("R-16")
@@ -282,7 +283,7 @@ def test_a_part_whose_end_alone_the_hand_does_not_hide_is_one():
     cloud = frame.cloud
     kept = cloud.labels != 2  # the hand is there: it is no part of the cloud
     frame = replace(frame, cloud=replace(cloud, points=cloud.points[kept], labels=cloud.labels[kept]))
-    assert lifted([frame], found, risen, T).others == (found.others[1],)
+    assert lifted([frame], found, risen, T, GRIP).others == (found.others[1],)
 
 
 @pytest.mark.requirement("R-16")
@@ -295,10 +296,28 @@ def test_what_was_taken_for_a_part_and_stays_is_another_thing():
     frames = seen(se3.apply(T, HANDLE), HEAD, NEIGHBOUR)
     risen = risen_points(frames, found, HELD.rise)
     assert len(risen) == len(HANDLE)
-    thing = lifted(frames, found, risen, T)
+    thing = lifted(frames, found, risen, T, GRIP)
     assert thing.target.p_base == pytest.approx(boxed(HANDLE).p_base, abs=0.004)
     assert thing.others[0] == found.others[0]
     assert thing.others[1].p_base == pytest.approx(boxed(HEAD).p_base, abs=0.004)
+
+
+@pytest.mark.requirement("R-16")
+def test_what_the_hand_hides_belongs_to_what_is_nearest_to_it():
+    points = np.concatenate([HANDLE, HEAD]).astype(np.float32)
+    both = boxed(points.astype(np.float64))
+    found = Sighting(both, (), 0, (LabelledCloud(points, np.ones(len(points), np.uint32), OVER),))
+    T = se3.make(p=(0.0, 0.0, 0.12))
+    away = HEAD[:, 1] < -0.195
+    hand = OVER + 0.6 * (HEAD[away] - OVER)
+    risen = se3.apply(T, HANDLE)
+    frame = seen(risen, HEAD[~away], hand)[0]
+    cloud = frame.cloud
+    kept = cloud.labels != 3  # the hand is no part of the cloud
+    frame = replace(frame, cloud=replace(cloud, points=cloud.points[kept], labels=cloud.labels[kept]))
+    thing = lifted([frame], found, risen, T, GRIP)
+    assert thing.target.p_base == pytest.approx(boxed(HANDLE).p_base, abs=0.004)
+    assert thing.others[0].p_base == pytest.approx(boxed(HEAD).p_base, abs=0.004)
 
 
 def test_a_thing_with_its_part_is_one():
