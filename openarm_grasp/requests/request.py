@@ -169,7 +169,7 @@ class GraspOutcome:
         duration: s of robot time.
         held: The object is in the hand.
         moved: It is elsewhere than before, and not where it was asked for; the message says where.
-        route: How it came to its place: "direct", "hand_over", "push" or another strategy; "" when it did not.
+        route: How it was done: "direct", "hand_over", "push", "aside" or another strategy; "" when it was not.
         options: Grasps that were considered for the newest plan, by arm, the preferred first.
         state_times: Time spent in each state.
         recording: Path of the flight recording of a failure; "" when there is none.
