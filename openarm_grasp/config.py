@@ -234,7 +234,7 @@ class PushConfig(Config):
     most: int = Field(default=3, ge=0, le=10, description="pushes of one object, each followed by a check; 0: none")
     lengths: tuple[float, ...] = Field(default=(0.06, 0.10), description="lengths of a push that are tried, m")
     aside: tuple[float, ...] = Field(
-        default=(0.20, 0.15, 0.10, 0.06), description="lengths of a push aside, the first that can be planned is taken, m"
+        default=(0.20, 0.15, 0.10, 0.06), description="lengths of a push aside that are tried, the longest first, m"
     )
     directions: int = Field(default=12, ge=1, le=72, description="directions of a push that are tried")
     gap: float = Field(default=0.012, ge=0.005, le=0.05, description="hand to object before it is pushed, m")

@@ -61,7 +61,9 @@ class Sweep:
     rest: tuple[Detection, ...]
 
 
-def sweeps(found: Sighting, hand: Array, context: GraspContext, lengths: Sequence[float]) -> tuple[Sweep, ...]:
+def sweeps(
+    found: Sighting, hand: Array, context: GraspContext, lengths: Sequence[float], *, longest: bool = False
+) -> tuple[Sweep, ...]:
     """Find lines that push an object away from where it stands, those that move the least else first.
 
     A line begins behind the object, or behind what touches it there. Pushing along such lines makes room for grasps
@@ -72,6 +74,7 @@ def sweeps(found: Sighting, hand: Array, context: GraspContext, lengths: Sequenc
         hand: Points (n, 3) of the closed hand, TCP frame.
         context: Parameters and table.
         lengths: Of the way of the object, m.
+        longest: Of lines that move as many things the longest come first, else short ones that lead outwards.
     """
     config, floor = context.config, context.table.top_z
     things, around = [_standing(object_points(found.clouds), found.target, floor)], points_around(found.clouds)
@@ -102,7 +105,7 @@ def sweeps(found: Sighting, hand: Array, context: GraspContext, lengths: Sequenc
         rest = tuple(one for i, one in enumerate(found.others, start=1) if i not in moved)
         sweep = Sweep(box, p[:2] + whole * ahead, found.target.p_base[:2] + length * ahead, heap, rest)
         out = float(ahead @ direction(things[0][:, :2].mean(axis=0) - crowd))
-        ways.append((len(moved), whole - _OUTWARD * out, sweep))
+        ways.append((len(moved), -length if longest else whole - _OUTWARD * out, sweep))
     return tuple(sweep for _, _, sweep in sorted(ways, key=lambda way: way[:2]))
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Push an object away from where it is, whether a hand can grasp it or not: what it hides or blocks comes free.
 
-A plate that no hand can close on may lie on a spoon. The longest line that can be planned is taken, with all that the
-hand meets on it; the camera says how far the object has moved. Base frame, m.
+A plate that no hand can close on may lie on a spoon. Of the lines that move the fewest other things the longest is taken;
+the camera says how far the object has moved. Base frame, m.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.request import Feasible, GraspOutcome, PushedAside
 from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.find import detect
-from openarm_grasp.strategies.push import Push, agree_to_push, carry_out_push, plan_sweep
+from openarm_grasp.strategies.push import agree_to_push, carry_out_push, plan_sweep
 from openarm_grasp.strategies.run import Run
 
 
@@ -45,7 +45,7 @@ async def _pushed(run: Run, found: Sighting) -> GraspOutcome:
     task, config, avoid, text = run.task, run.config, list[Array](), ""
     for number in range(1, config.push.most + 1):
         try:
-            planned = await _planned(task, found, avoid)
+            planned = replace(await plan_sweep(task, found, avoid, config.push.aside, longest=True), why="aside")
         except OpenArmError as error:
             if number == 1 or error.code not in NO_WAY:
                 raise
@@ -54,8 +54,8 @@ async def _pushed(run: Run, found: Sighting) -> GraspOutcome:
             return run.answer(Code.OK, f"can be done: {planned}", Feasible(str(planned)))
         await agree_to_push(task, planned, found)
         run.arm, run.tried = planned.arm, run.tried + 1
-        task.displaced = "after the pushes"
         pushed, text = await carry_out_push(task, planned, found, number)
+        task.displaced = "after the pushes"
         run.seen_at = pushed.target.p_base
         task.findings.sighting = run.findings.sighting = pushed
         if planned.moves(found.target, pushed.target):
@@ -63,16 +63,3 @@ async def _pushed(run: Run, found: Sighting) -> GraspOutcome:
         avoid.append(planned.ahead)
         found = pushed
     raise OpenArmError(Code.PLACE_FAILED, f"{text}; it does not move aside")
-
-
-async def _planned(task: Task, found: Sighting, avoid: list[Array]) -> Push:
-    """The longest push that can be planned, "aside" in its reason."""
-    fault: OpenArmError | None = None
-    for length in task.context.config.push.aside:
-        try:
-            return replace(await plan_sweep(task, found, avoid, (length,)), why="aside")
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-            fault = fault or error
-    raise fault or OpenArmError(Code.UNREACHABLE, "no length of a push aside is allowed; see push.aside")

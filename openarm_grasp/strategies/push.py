@@ -38,8 +38,8 @@ from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 
-#: Lines through a crowd that are planned at most, by arm.
-_SWEEPS = 10
+#: Lines through a crowd that are planned at most, by arm and length.
+_SWEEPS = 5
 #: Turns of a hand that meets things of any shape, deg.
 _TURNS = (0.0, 30.0, -30.0)
 #: What moves by a smaller share of a push than this has not gone along; directions so near (cosine) are the same.
@@ -239,7 +239,9 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
     raise OpenArmError(Code.UNREACHABLE, f"no hand comes behind it: {'; '.join(faults)}")
 
 
-async def plan_sweep(task: Task, found: Sighting, avoid: Sequence[Array], lengths: Sequence[float]) -> Push:
+async def plan_sweep(
+    task: Task, found: Sighting, avoid: Sequence[Array], lengths: Sequence[float], *, longest: bool = False
+) -> Push:
     """Find a line that pushes an object along with what it meets.
 
     Args:
@@ -247,6 +249,7 @@ async def plan_sweep(task: Task, found: Sighting, avoid: Sequence[Array], length
         found: The object and its neighbours.
         avoid: (2,) directions in which a push did not move it, or from which one has.
         lengths: Of its way, m.
+        longest: Of lines that move as many things the longest is tried first, else short ones that lead outwards.
 
     Raises:
         OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
@@ -255,8 +258,10 @@ async def plan_sweep(task: Task, found: Sighting, avoid: Sequence[Array], length
     start = found.target.p_base[:2]
     for arm in context.arm_order("auto", float(start[1])):
         hand = closed_hand(robot.description, arm)
-        lines = (one for one in sweeps(found, hand, context, lengths) if _is_open(one.freed - start, avoid))
-        for sweep in islice(lines, _SWEEPS):
+        lines = (
+            one for one in sweeps(found, hand, context, lengths, longest=longest) if _is_open(one.freed - start, avoid)
+        )
+        for sweep in islice(lines, _SWEEPS * len(lengths)):
             ways = push_ways(sweep.met, sweep.end, context.config, hand, context.hand, _TURNS)
             if not ways:
                 faults.append(f"{arm} hand: what stands there is too thin for it")
@@ -270,7 +275,7 @@ async def plan_sweep(task: Task, found: Sighting, avoid: Sequence[Array], length
                 continue
             return Push(arm, start, sweep.freed, ways[plan.chosen], plan, "through what is near it")
     why = f"{faults[0]} ({len(faults) - 1} other lines refused)" if faults else "there is no room around it"
-    raise OpenArmError(Code.UNREACHABLE, f"nor can it be pushed out of what is near it: {why}")
+    raise OpenArmError(Code.UNREACHABLE, f"no line pushes it out of what is near it: {why}")
 
 
 async def agree_to_push(task: Task, planned: Push, found: Sighting) -> None:
