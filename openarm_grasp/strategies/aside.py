@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Push an object away from where it is, whether a hand can grasp it or not: what it hides or blocks comes free.
 
-A plate that no hand can close on may lie on a spoon. Of the lines that move the fewest other things the longest is taken;
+A plate that no hand can close on may lie on a spoon. Of lines that move the fewest other things the longest is taken;
 the camera says how far the object has moved. Base frame, m.
 """
 
