@@ -13,6 +13,7 @@ from itertools import product
 from math import ceil, cos, hypot, inf, pi, radians, sin
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from openarm_common import se3
 from openarm_common.detection import Detection
@@ -36,6 +37,8 @@ _TIPS = 0.03
 _ROW, _MEET = 0.006, 0.004
 #: Things are not pushed farther than this beyond where arms reach, and no farther than this at once, m.
 _BEYOND, _LONGEST = 0.05, 0.30
+#: What ends this near to something may be seen as one with it, m.
+_NEXT_TO = 0.03
 #: Share of a line by which what stands where no arm reaches must come nearer to there.
 _COMES = 0.5
 #: A line away from the middle of the crowd may be so much longer, m.
@@ -64,7 +67,7 @@ class Sweep:
 def sweeps(
     found: Sighting, hand: Array, context: GraspContext, lengths: Sequence[float], *, longest: bool = False
 ) -> tuple[Sweep, ...]:
-    """Find lines that push an object away from where it stands, those that move the least else first.
+    """Find lines that push an object away from where it stands, those first that move, and end next to, the least else.
 
     A line begins behind the object, or behind what touches it there. Pushing along such lines makes room for grasps
     in heaps (Danielczuk et al., "Linear push policies to increase grasp access for robot bin picking", CASE 2018).
@@ -105,7 +108,9 @@ def sweeps(
         rest = tuple(one for i, one in enumerate(found.others, start=1) if i not in moved)
         sweep = Sweep(box, p[:2] + whole * ahead, found.target.p_base[:2] + length * ahead, heap, rest)
         out = float(ahead @ direction(things[0][:, :2].mean(axis=0) - crowd))
-        ways.append((len(moved), -length if longest else whole - _OUTWARD * out, sweep))
+        ends = KDTree(cells[:, :2] + whole * ahead)
+        near = sum(ends.query(one[:, :2])[0].min() < _NEXT_TO for i, one in enumerate(things) if i not in moved)
+        ways.append((len(moved) + near, -length if longest else whole - _OUTWARD * out, sweep))
     return tuple(sweep for _, _, sweep in sorted(ways, key=lambda way: way[:2]))
 
 

@@ -17,7 +17,7 @@ from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.request import Feasible, GraspOutcome, PushedAside
 from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.find import detect
-from openarm_grasp.strategies.push import agree_to_push, carry_out_push, plan_sweep
+from openarm_grasp.strategies.pushing import agree_to_push, carry_out_push, plan_sweep
 from openarm_grasp.strategies.run import Run
 
 

@@ -46,7 +46,7 @@ def test_out_of_a_row_an_object_is_pushed_across_it():
     first, *others = sweeps(ROW, hand(), CONTEXT, LENGTHS)
     assert abs(ahead(first)[0]) == pytest.approx(1.0, abs=1e-6)
     assert first.rest == ROW.others
-    assert np.linalg.norm(first.freed - ROW.target.p_base[:2]) == pytest.approx(LENGTHS[0])
+    assert np.linalg.norm(first.freed - ROW.target.p_base[:2]) == pytest.approx(LENGTHS[1])  # clear of them
     along = [one for one in others if abs(ahead(one)[1]) > 0.99]  # with what is ahead, or comes before it
     assert all(len(one.rest) < 2 for one in along)
 
