@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pushes have in common: a line that was planned, the hand that goes along it, and what is seen then. Base frame, m.
+"""What pushes have in common: a line that was planned, the hand that goes along it, and what is seen then. Base frame.
 
 A closed hand goes behind an object, low, and along a straight line; then it goes home, and the camera looks.
 """
