@@ -148,7 +148,7 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     answers = [
         GraspResult(True, Code.OK, "placed", "SUCCESS", "cup", "left", 1, (0.2, 0.3, 0.4), 9.0, (0.3, 0.0, 0.42)),
         GraspResult(False, Code.TOO_WIDE, "190 mm", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0, (0.2, 0.1, 0.45)),
-        *[GraspResult(False, Code.UNKNOWN_OBJECT, "no more", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0)] * 6,
+        *[GraspResult(False, Code.UNKNOWN_OBJECT, "no more", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0)] * 2,
     ]
     asked: list[dict[str, Any]] = []
 
@@ -167,7 +167,7 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     assert outcome.text == "left: anything at (0.200, 0.100) m: TOO_WIDE: 190 mm\n"
     data = json.loads(json.dumps(outcome.data, allow_nan=False))
     assert data["left"][0]["where"] == [0.2, 0.1]
-    assert [row["place"] for row in data["results"]] == [[0.2, 0.3, 0.4], *[None] * 7]
+    assert [row["place"] for row in data["results"]] == [[0.2, 0.3, 0.4], *[None] * 3]
     assert asked[0]["place_choices"] == ((0.2, 0.26), (0.2, 0.38))
     assert asked[2]["exclude_near"] == ((0.2, 0.3), (0.2, 0.1))
-    assert asked[3]["object_at"] == (0.2, 0.1)
+    assert (asked[3]["object_at"], asked[3]["phase"]) == ((0.2, 0.1), "aside")

@@ -318,7 +318,7 @@ def test_what_has_turned_in_the_hand_is_put_back_though_the_map_shows_it_there(w
 
 
 @pytest.mark.requirement("R-17")
-@pytest.mark.parametrize(("above", "let_go"), [(0.02, True), (0.05, False)])
+@pytest.mark.parametrize(("above", "let_go"), [(0.01, True), (0.05, False)])
 def test_what_meets_something_just_above_its_place_is_let_go_there(world, above, let_go):
     def hand(arm):
         plans = world.done(PlanPlace)
