@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Self
 
@@ -30,7 +31,7 @@ _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 #: What is refused so may be taken where others are pushed away from it.
 _BY_PLACE = (*(code for code in NO_WAY if code is not Code.TOO_WIDE), *_GONE)
-#: What is refused so may lie on others, or keep a hand from them.
+#: What is refused so may lie on others, or keep a hand from them; the likelier first.
 _IN_THE_WAY = (Code.TOO_WIDE, Code.IN_COLLISION)
 #: With these the camera had not shown enough yet: another look may.
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
@@ -194,8 +195,8 @@ class Order:
             if one.where is not None and one.code in _BY_PLACE and not self._was_asked_for(one.where):
                 spots = self._spots(one.label)
                 return GraspRequest(one.label, object_at=one.where, exclude_near=stay, place_choices=spots)
-        for one in left:
-            if one.where is not None and one.code in _IN_THE_WAY and self._may_push(one.label, one.where):
+        for code, one in product(_IN_THE_WAY, left):
+            if one.code is code and one.where is not None and self._may_push(one.label, one.where):
                 return GraspRequest(one.label, object_at=one.where, exclude_near=stay, phase="aside")
         return None
 

@@ -86,7 +86,7 @@ async def plan_sweep(
     """
     context, robot, faults = task.context, task.robot, list[str]()
     start = found.target.p_base[:2]
-    for arm in context.arm_order("auto", float(start[1])):
+    for arm in context.arm_order(task.request.arm, float(start[1])):
         hand = closed_hand(robot.description, arm)
         lines = (
             one for one in sweeps(found, hand, context, lengths, longest=longest) if is_open(one.freed - start, avoid)

@@ -153,6 +153,12 @@ def test_what_does_not_move_aside_is_pushed_in_other_directions_and_reported(rob
     assert all(a @ b < 0.5 * np.linalg.norm(a) * np.linalg.norm(b) for a, b in itertools.combinations(ways, 2))
 
 
+@pytest.mark.parametrize("arm", ["left", "right"])
+def test_an_arm_that_is_asked_for_pushes_aside(robot, arm) -> None:
+    two = robot(0.30, 0.02)
+    assert two.ask("red", phase="aside", arm=arm).arm == arm
+
+
 def test_a_dry_run_of_a_push_aside_moves_nothing(robot) -> None:
     two = robot(0.30, 0.2)
     outcome = two.ask("red", phase="aside", dry_run=True)
