@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import product, takewhile
 from pathlib import Path
 from typing import Self
 
@@ -115,6 +115,28 @@ class Left:
         return f"{self.label}{at}: {self.code}: {self.why}"
 
 
+@dataclass(frozen=True)
+class _InVain:
+    """A request that placed nothing.
+
+    Attributes:
+        request: What was asked for.
+        code: Of the answer.
+        touched: An arm has moved for it.
+        seen: The object was seen.
+    """
+
+    request: GraspRequest
+    code: Code
+    touched: bool
+    seen: bool
+
+    @property
+    def aside(self) -> bool:
+        """Whether something was to be pushed aside."""
+        return self.request.phase == "aside"
+
+
 @dataclass
 class Order:
     """Objects to be picked one after the other, in rounds: of those that fit, the easiest first.
@@ -149,14 +171,10 @@ class Order:
     _before: list[Left] = field(default_factory=list[Left])
     #: Places that things were asked for by in this round.
     _by_place: list[Spot] = field(default_factory=list[Spot])
-    #: Places of what was pushed aside since the newest success.
-    _pushed: list[Spot] = field(default_factory=list[Spot])
-    #: Requests after which things lay, or were seen, otherwise; since the newest success, how many moved something in
-    #: vain, saw nothing, or did not see a thing at its place.
+    #: Requests after which things lay, or were seen, otherwise.
     _moved: int = 0
-    _in_vain: int = 0
-    _unseen: int = 0
-    _otherwise: int = 0
+    #: Requests since the newest success.
+    _in_vain: list[_InVain] = field(default_factory=list[_InVain])
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -185,7 +203,7 @@ class Order:
                 stay = (*self._stand, *left)
                 return GraspRequest(f"{EASIEST} {label}", exclude_near=stay, place_choices=self._spots(label))
         left = [one for one in self.left if one.label in wanted]
-        if self._in_vain >= _IN_VAIN or not left:
+        if self._given_up or not left:
             return None
         if any(one.after < self._moved for one in left):
             self._before, self.left, self._asked, self._by_place = self.left, [], set(), []
@@ -200,9 +218,26 @@ class Order:
                 return GraspRequest(one.label, object_at=one.where, exclude_near=stay, phase="aside")
         return None
 
+    @property
+    def _given_up(self) -> bool:
+        return sum(one.touched and not one.aside for one in self._in_vain) >= _IN_VAIN
+
+    @property
+    def _unseen(self) -> int:
+        """How many requests in a row have seen nothing."""
+        blind = takewhile(lambda one: one.code in _NOT_SEEN and not one.seen, reversed(self._in_vain))
+        return sum(1 for _ in blind)
+
+    @property
+    def _otherwise(self) -> int:
+        """How many things were not seen at their places: they are seen as parts of something else now."""
+        by_place = (one for one in self._in_vain if one.request.object_at is not None and not one.aside)
+        return sum(one.code in _GONE and not one.seen for one in by_place)
+
     def _may_push(self, label: str, where: Spot) -> bool:
-        known = any(math.dist(where, spot) < _SAME_SPOT for spot in self._pushed)
-        return takes_all(label) and len(self._pushed) < _PUSHES and not known
+        pushed = [one.request.object_at for one in self._in_vain if one.aside]
+        known = any(spot is not None and math.dist(where, spot[:2]) < _SAME_SPOT for spot in pushed)
+        return takes_all(label) and len(pushed) < _PUSHES and not known
 
     def _enough(self, label: str) -> bool:
         most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
@@ -247,23 +282,21 @@ class Order:
             held: A hand may hold it still: it is put down before anything else; one that cannot do that ends the label.
         """
         label, after = self.label_of(request), self._moved
-        if request.phase == "aside" and request.object_at is not None and code not in _OVER:
-            self._pushed.append((float(request.object_at[0]), float(request.object_at[1])))
-            self._moved += touched
+        self._moved += touched or code is Code.OK
+        self._in_vain.append(_InVain(request, code, touched, seen is not None))
+        if request.phase == "aside" and code not in _OVER:
             return None
         self.left = [one for one in self.left if one.label != label or one.where is not None]
         placing = request.phase == "place"
         self._held = label if held and not placing else ""
         if placing and code is Code.NOT_READY:
             return None  # no hand holds anything: it is where it was seen last
-        self._moved += touched or code is Code.OK
         if code is Code.OK:
             self._place(label, placed, placing=placing)
             return None
         if (placing and held) or code in (*_OVER, Code.INVALID_ARGUMENT):
             self.failed[label] = f"{code}: {message}"
             return None
-        self._in_vain += touched
         where = None if seen is None else (float(seen[0]), float(seen[1]))
         if request.object_at is not None:
             spot = (float(request.object_at[0]), float(request.object_at[1]))
@@ -273,11 +306,10 @@ class Order:
         if where is None and code in _GONE:
             if request.object_at is None:
                 return self._none_left(label, code, message)
-            self._otherwise += 1  # it is seen as a part of something else now
             self._moved += self._otherwise < _UNSEEN
             return None
-        self._unseen = self._unseen + 1 if where is None and code in _NOT_SEEN else 0
-        if self._in_vain >= _IN_VAIN or self._unseen >= _UNSEEN or (where is None and not self._unseen):
+        unseen = self._unseen
+        if self._given_up or unseen >= _UNSEEN or (where is None and not unseen):
             self._asked.add(label)
         if code in _GONE and where is not None and any(self._at(where, label)):
             return None
@@ -287,7 +319,7 @@ class Order:
         """Note that an object of a label was placed."""
         if placing and self.left:
             self.left.pop()  # what was left in the hand
-        self._in_vain, self._unseen, self._otherwise, self._before, self._pushed = 0, 0, 0, [], []
+        self._in_vain, self._before = [], []
         self.placed.append(label)
         if len(placed) >= 2:
             self._stand.append((float(placed[0]), float(placed[1])))
