@@ -22,7 +22,7 @@ from openarm_common.robot.hand import HandParts
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.detections import NEXT_TO, Sighting
 from openarm_grasp.perception.sightings import in_box, object_points, points_around
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, tips_height
 from openarm_grasp.planning.neighbours import standing_boxes, tops
@@ -37,8 +37,6 @@ _TIPS = 0.03
 _ROW, _MEET = 0.006, 0.004
 #: Things are not pushed farther than this beyond where arms reach, and no farther than this at once, m.
 _BEYOND, _LONGEST = 0.05, 0.30
-#: What ends this near to something may be seen as one with it, m.
-_NEXT_TO = 0.03
 #: Share of a line by which what stands where no arm reaches must come nearer to there.
 _COMES = 0.5
 #: A line away from the middle of the crowd may be so much longer, m.
@@ -88,14 +86,15 @@ def sweeps(
     ways: list[tuple[int, float, Sweep]] = []
     for length, k in product(lengths, range(config.push.directions)):
         R = se3.rot_z(2.0 * pi * k / config.push.directions)
+        ahead = R[:2, 0]
+        if not _nearer(found.target.p_base[:2], length * ahead, context):
+            continue
         line = _line([thing @ R for thing in things], half, room, length)
         if line is None:
             continue
         begin, near, far, moved = line
-        cells, whole, ahead = np.concatenate([things[i] for i in moved]), near - begin + length, R[:2, 0]
+        cells, whole = np.concatenate([things[i] for i in moved]), near - begin + length
         if whole > _LONGEST or not _allowed(cells[:, :2], whole * ahead, context):
-            continue
-        if not _nearer(found.target.p_base[:2], length * ahead, context):
             continue
         aside = float(np.median(things[0] @ R[:, 1]))
         local = cells @ R
@@ -109,7 +108,7 @@ def sweeps(
         sweep = Sweep(box, p[:2] + whole * ahead, found.target.p_base[:2] + length * ahead, heap, rest)
         out = float(ahead @ direction(things[0][:, :2].mean(axis=0) - crowd))
         ends = KDTree(cells[:, :2] + whole * ahead)
-        near = sum(ends.query(one[:, :2])[0].min() < _NEXT_TO for i, one in enumerate(things) if i not in moved)
+        near = sum(ends.query(one[:, :2])[0].min() < NEXT_TO for i, one in enumerate(things) if i not in moved)
         ways.append((len(moved) + near, -length if longest else whole - _OUTWARD * out, sweep))
     return tuple(sweep for _, _, sweep in sorted(ways, key=lambda way: way[:2]))
 

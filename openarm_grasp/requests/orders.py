@@ -143,10 +143,10 @@ class Order:
 
     In a round everything in view is asked for once. What cannot be taken is left, and asked for in another round when
     an arm has moved anything since: it may have been in the way, or have hidden it, or lie otherwise itself. After a
-    round in which nothing has moved, each thing is asked for by where it is: what stands close to it may be pushed
-    aside then. Where whatever there is is wanted, what no hand takes is pushed aside itself at last, since things may
-    lie below it. The order ends when nothing is left, when nothing moves any more, or when all that moves does so in
-    vain.
+    round in which nothing has moved, each thing that fits into a hand is asked for by where it is: what stands close to
+    it may be pushed aside then. Where whatever there is is wanted, what no hand takes is pushed aside itself at last,
+    since things may lie below it. The order ends when nothing is left, when nothing moves any more, or when all that
+    moves does so in vain.
 
     Attributes:
         labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.

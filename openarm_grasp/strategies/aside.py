@@ -53,7 +53,7 @@ async def _pushed(run: Run, found: Sighting) -> GraspOutcome:
         if run.request.dry_run:
             return run.answer(Code.OK, f"can be done: {planned}", Feasible(str(planned)))
         await agree_to_push(task, planned, found)
-        run.arm, run.tried = planned.arm, run.tried + 1
+        run.arm = planned.arm
         pushed, text = await carry_out_push(task, planned, found, number)
         task.displaced = "after the pushes"
         run.seen_at = pushed.target.p_base
