@@ -87,6 +87,7 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
         rise: Its upper end is at least this much higher, m.
     """
     before = cluster_of(sighting)
+    place = KDTree(object_points(sighting.clouds[-1:])[:, :2])
     frame = next((frame for frame in reversed(frames) if frame.cloud is not None), None)
     found = [np.empty((0, 3))]
     if frame is not None and frame.cloud is not None:
@@ -94,9 +95,9 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
             points = frame.cloud.points[frame.cloud.labels == number].astype(np.float64)
             if len(points) < _LEAST_POINTS:
                 continue
-            now = Cluster.of(points)
-            away = float(np.linalg.norm(now.centroid[:2] - before.centroid[:2]))
-            if now.top - before.top >= rise and away <= 0.5 * (now.extent + before.extent):
+            # of what hangs in a hand an end may be all that is seen; a few points that fly make it no neighbour
+            beside = float(np.percentile(place.query(points[:, :2])[0], 2.0))
+            if Cluster.of(points).top - before.top >= rise and beside <= _IN_VIEW:
                 found.append(points)
     clouds, points = sighting.clouds[-1:], np.concatenate(found)
     points = points[np.linalg.norm(points - before.centroid, axis=1) < _REACH]

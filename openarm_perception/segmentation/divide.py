@@ -43,6 +43,8 @@ _ALONG = 0.25
 _NARROW = 1.0
 #: Raised pixels this near to a thing, and to no other, are its own.
 _FILLED = 2
+#: Unless they lie behind it by more than slant and as many standard deviations of the depth.
+_BEHIND = 4.0
 
 
 class SegmentationConfig(Config):
@@ -139,14 +141,26 @@ def divide(
         root = join_smooth(root, patch, border, rgb)
         number = _number(root, patch, area, moments, support, intrinsics, config)
     pieces = tuple(len(np.unique(piece[(number == i) & (piece > 0)])) for i in range(1, int(number.max()) + 1))
-    return Divided(_filled(number[patch], raised), patch, even, heights, pieces)
+    return Divided(_filled(number[patch], np.where(raised, z, np.nan), pixel, noise), patch, even, heights, pieces)
 
 
-def _filled(label: NDArray[np.uint16], raised: Mask) -> NDArray[np.uint16]:
-    """Return labels (h, w) that also have the raised pixels next to their own: holes, and those that float."""
+def _filled(label: NDArray[np.uint16], z: NDArray[np.float32], pixel: float, noise: np.float32) -> NDArray[np.uint16]:
+    """Return labels (h, w) that also have the pixels next to their own: holes, and those that float.
+
+    What lies behind a thing, such as noise on the table beside its far edge, is not its own.
+
+    Args:
+        label: (h, w), 0: none.
+        z: (h, w) depth of what rises above the support, m; NaN elsewhere.
+        pixel: Metres across of a pixel at 1 m.
+        noise: Of the depth at 1 m, m.
+    """
+    kernel = np.ones((3, 3), np.uint8)
+    behind = np.float32(SLANT * pixel) * z + np.float32(_BEHIND) * noise * z * z
     for _ in range(_FILLED):
-        around = cv2.dilate(label, np.ones((3, 3), np.uint8))
-        label = np.where((label == 0) & raised, around, label)
+        around = cv2.dilate(label, kernel)
+        farthest = cv2.dilate(np.where(label > 0, z, np.float32(0.0)), kernel)
+        label = np.where((label == 0) & (z <= farthest + behind), around, label)
     return label
 
 
