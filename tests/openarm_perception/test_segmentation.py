@@ -61,6 +61,18 @@ def test_boxes_and_cans_are_measured(tabletop, noise):
         assert one.points[:, 2].max() == pytest.approx(0.40 + thing.size[2], abs=0.02)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_on_the_table_behind_a_tall_thing_is_no_part_of_it(tabletop, seed):
+    """Next to its far edge the image shows table, here 10 cm and more behind it."""
+    can = tabletop.Thing("blue", "cylinder", (0.07, 0.07, 0.16), 0.3, 0.25)
+    view = tabletop.render([can])
+    points = seen(view, DepthNoiseConfig(enabled=True), seed)
+    result = segment(points, view.intrinsics, rgb=view.rgb, T_base_camera=view.T_base_camera)
+    (one,) = result.clusters
+    raw = se3.apply(view.T_base_camera, points[result.label == one.id].astype(np.float64))
+    assert np.linalg.norm(raw[:, :2] - can.position[:2], axis=1).max() < 0.035 + 0.010
+
+
 def test_without_a_pose_the_table_may_be_slanted(tabletop):
     thing = tabletop.Thing("red", "box", (0.05, 0.07, 0.06), 0.3, 0.0, 0.4)
     camera = tabletop.look_at((0.9, 0.2, 0.8), (0.27, 0.0, 0.42), (0.0, 1.0, 0.0))
