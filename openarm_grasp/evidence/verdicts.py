@@ -87,16 +87,15 @@ def judge_grip(
         e: What the gripper says.
         config: Thresholds.
         was_held: The object was held before: an empty hand has lost it.
-        apertures: Least and greatest gap around what is no box, m; None: the object is `e.expected` wide, within
+        apertures: Least and greatest gap around what is no box, m; None: the object is `e.expected` wide. Either within
             `width_tolerance`.
-        closed: Gap after the hand had closed, m: one that has changed by more than `slip` since says that the object
-            has turned or slipped. None: not judged.
+        closed: Gap after the hand had closed, m. It is the reference in place of the width then: a gap that has changed
+            by more than `slip` since says that the object has turned or slipped. None: it was not measured.
     """
     empty = Code.GRASP_LOST if was_held else Code.GRASP_MISSED
     gap, width = f"gap {e.gap * 1e3:.1f} mm", f"the object's {e.expected * 1e3:.1f} mm"
-    least, most = e.expected - config.width_tolerance, e.expected + config.width_tolerance
+    least, most = apertures or (e.expected, e.expected)
     if apertures is not None:
-        least, most = apertures
         width = f"the {least * 1e3:.1f} to {most * 1e3:.1f} mm that its surface has there"
     if e.tcp_error > config.max_tcp_error:
         off, limit = e.tcp_error * 1e3, config.max_tcp_error * 1e3
@@ -105,15 +104,15 @@ def judge_grip(
         )
     if e.gap <= config.closed_below:
         return GripperVerdict(empty, f"{gap}: the fingers are closed on nothing")
-    if e.gap > most:
+    if closed is not None:
+        if abs(e.gap - closed) > config.slip:
+            was, limit = f"{closed * 1e3:.1f} mm when the hand had closed", f"at most {config.slip * 1e3:.0f} mm"
+            why = f"{gap}, {was}: the object has turned or slipped in the hand, expected a change of {limit}"
+            return GripperVerdict(Code.GRASP_LOST, why)
+    elif e.gap > most + config.width_tolerance:
         return GripperVerdict(Code.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it")
-    if e.gap < least:
+    elif e.gap < least - config.width_tolerance:
         return GripperVerdict(empty, f"{gap} is narrower than {width}: something else is between the fingers")
-    if closed is not None and abs(e.gap - closed) > config.slip:
-        was, limit = f"{closed * 1e3:.1f} mm when the hand had closed", f"at most {config.slip * 1e3:.0f} mm"
-        return GripperVerdict(
-            Code.GRASP_LOST, f"{gap}, {was}: the object has turned or slipped in the hand, expected a change of {limit}"
-        )
     if abs(e.speed) >= config.max_speed:
         return GripperVerdict(Code.GRASP_MISSED, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest")
     if config.use_effort and abs(e.effort) <= config.min_effort:
