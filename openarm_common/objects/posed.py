@@ -35,6 +35,11 @@ class PosedObject:
         return tuple(part.moved(self.T_box_object) for part in self.model.parts)
 
     @cached_property
+    def corners(self) -> Array:
+        """Corners (n, 3) of the parts in the frame of the box, m."""
+        return se3.apply(self.T_box_object, self.model.points)
+
+    @cached_property
     def visual(self) -> Array:
         """Vertices (n, 3) of what is seen, in the frame of the box, m."""
         return se3.apply(self.T_box_object, self.model.visual.vertices)

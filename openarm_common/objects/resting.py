@@ -27,6 +27,8 @@ _BARRIER, _BARRIER_SHARE = 0.0008, 0.01
 _LEAST_SHARE = 0.02
 #: A solid on a side tips over when it leans by less, rad.
 _LEAST_LEAN = math.radians(6.0)
+#: Share of its area by which a rectangle may be larger than one that an image does not tell from it.
+AS_SMALL = 0.03
 #: Triangles whose planes differ by less are one face: cosine, m.
 _SAME_NORMAL, _SAME_PLANE = math.cos(math.radians(0.3)), 1e-5
 
@@ -210,12 +212,34 @@ def _down(normal: Array, points: Array) -> Array:
 
 def least_box_yaw(points: Array) -> float:
     """Return the direction of the shorter edge of the smallest rectangle about points (n, 2), rad in (-pi/2, pi/2]."""
+    angles, low, high = _rectangles(points)
+    width, depth = (high - low).T
+    best = int(np.argmin(np.round(width * depth, 12)))
+    yaw = float(angles[best]) if width[best] <= depth[best] else float(angles[best]) + math.pi / 2.0
+    return yaw if yaw <= math.pi / 2.0 else yaw - math.pi
+
+
+def least_box_middles(points: Array, slack: float = AS_SMALL) -> Array:
+    """Return the middles (k, 2) of the rectangles about points (n, 2) that are as small as the smallest, m.
+
+    About a hammer or a pan there are several, centimetres apart, of which an image shows now one, now another.
+
+    Args:
+        points: m.
+        slack: Share by which the area of one may be larger.
+    """
+    angles, low, high = _rectangles(points)
+    area = np.prod(high - low, axis=1)
+    kept = area <= (1.0 + slack) * area.min()
+    (x, y), c, s = 0.5 * (low + high)[kept].T, np.cos(angles[kept]), np.sin(angles[kept])
+    return np.stack([c * x - s * y, s * x + c * y], axis=1)
+
+
+def _rectangles(points: Array) -> tuple[Array, Array, Array]:
+    """Return rectangles about points (n, 2), one along each edge of their hull: directions (k,), rad; corners (k, 2)."""
     corners = points[ConvexHull(points).vertices]
     edges = np.roll(corners, -1, axis=0) - corners
     angles = np.unique(np.round(np.arctan2(edges[:, 1], edges[:, 0]) % (math.pi / 2.0), 9))
     c, s = np.cos(angles), np.sin(angles)
-    width = np.ptp(corners @ np.stack([c, s]), axis=0)
-    depth = np.ptp(corners @ np.stack([-s, c]), axis=0)
-    best = int(np.argmin(np.round(width * depth, 12)))
-    yaw = float(angles[best]) if width[best] <= depth[best] else float(angles[best]) + math.pi / 2.0
-    return yaw if yaw <= math.pi / 2.0 else yaw - math.pi
+    along = np.stack([corners @ np.stack([c, s]), corners @ np.stack([-s, c])], axis=-1)
+    return angles, along.min(axis=0), along.max(axis=0)

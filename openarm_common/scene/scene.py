@@ -163,6 +163,11 @@ class SceneObject(Config):
         return posed_object(self.object, self.side, self.attitude)
 
     @property
+    def corners(self) -> Array | None:
+        """Corners (n, 3) of a mesh in its own frame, m; None of a plain shape."""
+        return self.posed.corners if self.shape == "mesh" else None
+
+    @property
     def rgba(self) -> Rgba:
         """Colour."""
         return (*self.posed.model.rgb, 1.0) if self.shape == "mesh" else COLORS[self.color]

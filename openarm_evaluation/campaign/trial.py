@@ -243,8 +243,8 @@ class Trials:
             name = min(lifted, key=lambda n: math.dist(robot.tracks[n][-1].p_world[:2], xy))
         if seen is not None and not outcome.attempts:  # nothing rose: that which was looked at
             name = min(names, key=lambda n: float(np.linalg.norm(robot.tracks[n][0].p_world - np.array(seen))))
-        any_shape = task.scene.object(name).shape == "mesh"
-        verdict = judge(robot.tracks[name], xy, claimed=outcome.success, any_shape=any_shape)
+        corners = task.scene.object(name).corners
+        verdict = judge(robot.tracks[name], xy, claimed=outcome.success, corners=corners)
         return Trial(task.scene, task.seed, name, outcome, verdict, steps, wall_s, end_ns)
 
     def _rest(self, names: list[str]) -> None:

@@ -17,6 +17,8 @@ from pydantic import Field
 
 from openarm_common import se3
 from openarm_common.config import Config
+from openarm_common.objects.resting import least_box_middles
+from openarm_common.types import Array
 
 
 class JudgeConfig(Config):
@@ -80,19 +82,21 @@ def judge(
     *,
     claimed: bool,
     rules: JudgeConfig = RULES,
-    any_shape: bool = False,
+    corners: Array | None = None,
 ) -> Verdict:
     """Judge one object's track from before the grasp to after it.
 
     An object of any shape may rest on another side than before, since the request promises none, but not have fallen
-    since it was lifted last: what an earlier attempt dropped, the last one has taken up.
+    since it was lifted last: what an earlier attempt dropped, the last one has taken up. The centre of its footprint is
+    the middle of the smallest rectangle about it; of those that are as small (about a pan, two that are 44 mm
+    apart) the nearest to the target, since the request does not say which.
 
     Args:
         track: Samples in the order of time, the first from before anything moved.
         target_xy: Where the footprint centre should be, m, world; NaN when no place was chosen.
         claimed: Whether the run reported success.
         rules: Tolerances.
-        any_shape: Whether it is no plain shape.
+        corners: (n, 3) of an object of any shape, in its frame, m; None: a plain shape.
 
     Raises:
         ValueError: The track is empty or not in the order of time.
@@ -100,7 +104,8 @@ def judge(
     if not track or any(later.t_ns < earlier.t_ns for earlier, later in itertools.pairwise(track)):
         raise ValueError(f"a track needs samples in the order of time, got {len(track)}")
     first, last = track[0], track[-1]
-    error = math.hypot(last.p_world[0] - target_xy[0], last.p_world[1] - target_xy[1])
+    off = _centres(last, corners) - np.asarray(target_xy)
+    error = float(np.linalg.norm(off, axis=1).min())
     rise = rise_of(track)
     tilt = _tilt(first.q_xyzw, last.q_xyzw)
     end = end_of(track, rules)
@@ -116,17 +121,26 @@ def judge(
         reasons.append(
             f"is {1e3 * error:.1f} mm from the target, at most {1e3 * rules.place_tolerance:.0f} are allowed"
         )
-    if any_shape:
+    if corners is not None:
         if (fell := fall_of(last_carry(track, rules))) > rules.fall:
             reasons.append(f"fell: {1e3 * fell:.0f} mm freely, at most {1e3 * rules.fall:.0f} are allowed")
-    elif tilt > rules.tilt:
-        reasons.append(f"not upright: tilted by {math.degrees(tilt):.0f} degrees")
-    if not any_shape and abs(sink) > rules.height:
-        reasons.append(f"is not on the table as before: its centre is {1e3 * sink:+.0f} mm higher")
+    else:
+        if tilt > rules.tilt:
+            reasons.append(f"not upright: tilted by {math.degrees(tilt):.0f} degrees")
+        if abs(sink) > rules.height:
+            reasons.append(f"is not on the table as before: its centre is {1e3 * sink:+.0f} mm higher")
     if speed > rules.speed or turn > rules.turn:
         reasons.append(f"not at rest: {1e3 * speed:.0f} mm/s, {turn:.2f} rad/s")
     placed = not reasons
     return Verdict(placed, tuple(reasons), error, rise, tilt, speed, claimed and not placed)
+
+
+def _centres(sample: Sample, corners: Array | None) -> Array:
+    """Return the points (n, 2) that may be taken for the centre of the footprint of an object, world, m."""
+    if corners is None:
+        return sample.p_world[None, :2]
+    T = se3.make(se3.matrix_from_quat_xyzw(sample.q_xyzw), sample.p_world)
+    return least_box_middles(se3.apply(T, corners)[:, :2])
 
 
 def rise_of(track: Sequence[Sample]) -> float:

@@ -251,8 +251,8 @@ def _observed(
     for item, result in zip(items, results, strict=True):
         chosen = result.place_position if any(result.place_position) else (math.nan, math.nan)
         x, y = (place or chosen)[:2]
-        any_shape = item.shape == "mesh"
-        verdict = judge(observer.track(item.name), (x, y), claimed=result.success, any_shape=any_shape)
+        track = observer.track(item.name)
+        verdict = judge(track, (x, y), claimed=result.success, corners=item.corners)
         steps = [step for step in observer.steps() if len(items) == 1 or step.label in (item.label, result.label)]
         trials.append(Trial(scene, seed, item.name, result, verdict, _stamped(steps), wall_s))
     return trials

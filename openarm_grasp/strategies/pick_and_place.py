@@ -19,6 +19,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.detection import gap
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.objects.resting import least_box_middles
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.shapes import heavier_end, judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
@@ -485,7 +486,8 @@ def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame
     if before.cut and run.request.place is None and not run.request.place_choices:
         run.place_target = replace(placed.target, position=np.array([*now.p_base[:2], place[2]]))
         return seen
-    off, limit = float(np.linalg.norm((now.p_base - place)[:2])), _SEEN_WITHIN * config.place.tolerance
+    middles = np.concatenate([now.p_base[None, :2], least_box_middles(points[:, :2])])
+    off, limit = float(np.linalg.norm(middles - place[:2], axis=1).min()), _SEEN_WITHIN * config.place.tolerance
     if off > limit:
         text = f"its middle is seen {off * 1e3:.0f} mm from its target, expected at most {limit * 1e3:.0f} mm"
         return CameraVerdict(Code.PLACE_FAILED, text)

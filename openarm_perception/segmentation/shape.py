@@ -25,6 +25,10 @@ _BAND = 0.003
 _RMS = 0.0025
 #: A neighbour below the top within this is on a side, m.
 _SIDE_STEP = 0.015
+#: Of what is seen below its top, as much may lie farther than this out of a prism, m; half a pixel comes to it.
+_OUTER, _WIDER = 0.1, 0.00135
+#: Pixels below the top, of which that is asked.
+_ASKED = 15
 #: Pixels of a thing, without which its depth is not smoothed.
 _FEW = 30
 #: So much of what is seen lies on a prism, within that distance of it, m, and a pixel.
@@ -90,8 +94,9 @@ def judge(mask: Mask, other: Mask, z: NDArray[np.float32], rays: Array, eye: flo
     share = float(np.mean(((np.abs(seen[:, 2] - top) <= near) & (inside >= -near)) | (np.abs(inside) <= near)))
     if share < _SHARE:
         return Shape(around, top, f"{1.0 - share:.0%} of what is seen lies on no prism with its top")
-    wider = -float(np.median(inside[below])) if np.count_nonzero(below) >= _FEW else 0.0
-    if wider > _RMS:
+    # a rounded or tapered body has a level top, too, but is wider below it
+    wider = float(np.quantile(-inside[below], 1.0 - _OUTER)) if np.count_nonzero(below) >= _ASKED else 0.0
+    if wider > np.hypot(_WIDER, 0.5 * pixel):
         return Shape(around, top, f"its sides are {wider * 1e3:.1f} mm out of the prism below its top")
     return Shape(shape, top, "")
 

@@ -14,6 +14,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.objects.model import object_names
 from openarm_common.objects.posed import posed_object
+from openarm_common.objects.resting import least_box_middles
 from openarm_common.objects.solid import Part, hull_part
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
@@ -169,21 +170,37 @@ def lifted(*between: Sample, tilt: float = 0.0) -> list[Sample]:
     return [sample(0.0, 0.42), sample(0.1, 0.55), *between, sample(1.0, 0.43, tilt=tilt), sample(1.6, 0.43, tilt=tilt)]
 
 
+#: Corners of an object of any shape.
+CUBE = 0.02 * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+
+
 def test_an_object_of_any_shape_may_rest_on_another_side_but_not_fall() -> None:
     other = lifted(tilt=1.5)
-    assert judge(other, (0.3, 0.0), claimed=True, any_shape=True).placed
+    assert judge(other, (0.3, 0.0), claimed=True, corners=CUBE).placed
     assert not judge(other, (0.3, 0.0), claimed=True).placed
     falling = lifted(sample(0.2, 0.55), sample(0.25, 0.54, 0.49), sample(0.3, 0.50, 0.98), sample(0.32, 0.45))
     assert fall_of(falling) == pytest.approx(0.049, abs=1e-3)
-    found = judge(falling, (0.3, 0.0), claimed=True, any_shape=True)
+    found = judge(falling, (0.3, 0.0), claimed=True, corners=CUBE)
     assert not found.placed
     assert found.false_success
     assert found.reasons == (f"fell: 49 mm freely, at most {1e3 * RULES.fall:.0f} are allowed",)
     later = [replace(one, t_ns=one.t_ns + 2_000_000_000) for one in lifted()]
-    assert judge([*falling, *later], (0.3, 0.0), claimed=True, any_shape=True).placed  # of an attempt that failed
+    assert judge([*falling, *later], (0.3, 0.0), claimed=True, corners=CUBE).placed  # of an attempt that failed
     lowered = lifted(sample(0.2, 0.54, 0.2), sample(0.3, 0.52, 0.4), sample(0.4, 0.48, 0.5))
-    assert judge(lowered, (0.3, 0.0), claimed=True, any_shape=True).placed
+    assert judge(lowered, (0.3, 0.0), claimed=True, corners=CUBE).placed
     assert rise_of(lowered) == pytest.approx(0.13)
+
+
+def test_of_rectangles_that_are_as_small_the_nearest_counts() -> None:
+    """About a pan lie two, mirrored at its handle; their middles are 44 mm apart."""
+    corners = posed_object("pan").corners
+    middles = least_box_middles(corners[:, :2], 1e-6)
+    assert len(middles) == 2
+    assert np.ptp(middles, axis=0) == pytest.approx((0.041, 0.015), abs=1e-3)
+    for x, y in middles:
+        assert judge(lifted(), (0.3 + x, y), claimed=True, corners=corners).place_error < 1e-6
+    x, y = middles.mean(axis=0) + (-0.015, 0.041)
+    assert judge(lifted(), (0.3 + x, y), claimed=True, corners=corners).false_success
 
 
 def test_figures_say_what_is_graspable_and_what_of_it_was_placed() -> None:
