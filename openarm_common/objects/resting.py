@@ -236,7 +236,7 @@ def least_box_middles(points: Array, slack: float = AS_SMALL) -> Array:
 
 
 def _rectangles(points: Array) -> tuple[Array, Array, Array]:
-    """Return rectangles about points (n, 2), one along each edge of their hull: directions (k,), rad; corners (k, 2)."""
+    """Return a rectangle about points (n, 2) along each edge of their hull: directions (k,), rad, two corners (k, 2)."""
     corners = points[ConvexHull(points).vertices]
     edges = np.roll(corners, -1, axis=0) - corners
     angles = np.unique(np.round(np.arctan2(edges[:, 1], edges[:, 0]) % (math.pi / 2.0), 9))

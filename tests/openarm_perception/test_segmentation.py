@@ -101,6 +101,18 @@ def test_what_is_no_prism_says_so_and_keeps_its_cloud(tabletop):
     assert one.pixels > 1000
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_box_on_a_wider_foot_is_no_prism(tabletop, seed):
+    """Its top is a rectangle, and all that is seen lies within 4 mm of the sides below that."""
+    top = tabletop.Thing("red", "box", (0.050, 0.070, 0.055), 0.3, 0.1, 0.4)
+    foot = tabletop.Thing("red", "box", (0.058, 0.078, 0.030), 0.3, 0.1, 0.4)
+    view = tabletop.render([top, foot])
+    points = seen(view, DepthNoiseConfig(enabled=True), seed)
+    (one,) = segment(points, view.intrinsics, rgb=view.rgb, T_base_camera=view.T_base_camera).clusters
+    assert "out of the prism below its top" in one.shape.why
+    assert one.size[:2] == pytest.approx(foot.size[:2], abs=0.006)
+
+
 def test_what_is_in_front_hides_and_the_border_cuts(tabletop):
     behind = tabletop.Thing("red", "box", (0.05, 0.16, 0.05), 0.22, 0.0)
     front = tabletop.Thing("blue", "box", (0.03, 0.05, 0.12), 0.34, 0.0)
