@@ -222,12 +222,15 @@ def least_box_yaw(points: Array) -> float:
 def least_box_middles(points: Array, slack: float = AS_SMALL) -> Array:
     """Return the middles (k, 2) of the rectangles about points (n, 2) that are as small as the smallest, m.
 
-    About a hammer or a pan there are several, centimetres apart, of which an image shows now one, now another.
+    About a hammer or a pan there are several, centimetres apart, of which an image shows now one, now another. About
+    points on a line there is none.
 
     Args:
         points: m.
         slack: Share by which the area of one may be larger.
     """
+    if len(points) < 3 or np.linalg.matrix_rank(points - points[0], tol=1e-6) < 2:
+        return np.empty((0, 2))
     angles, low, high = _rectangles(points)
     area = np.prod(high - low, axis=1)
     kept = area <= (1.0 + slack) * area.min()
@@ -236,7 +239,7 @@ def least_box_middles(points: Array, slack: float = AS_SMALL) -> Array:
 
 
 def _rectangles(points: Array) -> tuple[Array, Array, Array]:
-    """Return a rectangle about points (n, 2) along each edge of their hull: directions (k,), rad, two corners (k, 2)."""
+    """Return a rectangle about points (n, 2) along each edge of their hull: directions (k,), rad; corners (k, 2)."""
     corners = points[ConvexHull(points).vertices]
     edges = np.roll(corners, -1, axis=0) - corners
     angles = np.unique(np.round(np.arctan2(edges[:, 1], edges[:, 0]) % (math.pi / 2.0), 9))

@@ -199,6 +199,8 @@ def test_of_rectangles_that_are_as_small_the_nearest_counts() -> None:
     assert np.ptp(middles, axis=0) == pytest.approx((0.041, 0.015), abs=1e-3)
     for x, y in middles:
         assert judge(lifted(), (0.3 + x, y), claimed=True, corners=corners).place_error < 1e-6
+    for line in (np.empty((0, 2)), corners[:1, :2], np.outer(np.arange(5.0), (1.0, 2.0))):
+        assert len(least_box_middles(line)) == 0
     x, y = middles.mean(axis=0) + np.array([-0.015, 0.041])
     assert judge(lifted(), (0.3 + x, y), claimed=True, corners=corners).false_success
 
