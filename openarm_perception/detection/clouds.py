@@ -13,7 +13,7 @@ from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.geometry.depth import Deprojector, DepthLimits, View
-from openarm_perception.geometry.patch import denoise
+from openarm_perception.geometry.patch import denoise, keep_edges
 
 #: What lies farther from every detection is far, m.
 _AROUND = 0.15
@@ -53,7 +53,8 @@ def labelled_cloud(
     if flying.enabled:
         label_flying(scan, flying, floats)
     z = view.depth.astype(np.float32) * np.float32(scan.scale)
-    z, _ = denoise(np.where((z >= limits.near) & (z <= limits.far), z, np.float32(np.nan)))
+    z = np.where((z >= limits.near) & (z <= limits.far), z, np.float32(np.nan))
+    z = keep_edges(z, *denoise(z), 2.0 / (view.intrinsics.fx + view.intrinsics.fy))
     points = Deprojector(limits).organised(z.astype(np.float32), view.intrinsics)
     kept &= (floats == 0) & np.isfinite(points[..., 2])
     return LabelledCloud(points[kept], label[kept], np.zeros(3))

@@ -23,6 +23,9 @@ _FEW_HOLES = 0.001
 _FAR = 100.0
 #: Pixels that the noise is measured at.
 _ASKED = 20_000
+#: A median that is farther from what was measured lies between two surfaces: in what is left of the noise (four times
+#: that of a pixel), and in pixels of a slanted surface.
+_BETWEEN, _STEEP = 16.0, 4.0
 #: Pixels around a detection that belong to its patch.
 _MARGIN = 4
 
@@ -96,3 +99,17 @@ def denoise(z: Array | NDArray[np.float32]) -> tuple[Array, float]:
     smooth[smooth > 0.99 * _FAR] = np.nan
     # a median of 25 leaves a quarter of the noise (sqrt(pi / 2 / 25))
     return smooth, 0.25 * noise
+
+
+def keep_edges(z: Array | NDArray[np.float32], smooth: Array, noise: float, pixel: float) -> Array:
+    """Return smooth depth with the measured one at edges, where the median lies between two surfaces.
+
+    Args:
+        z: Depth as measured, m.
+        smooth: What `denoise` has made of it.
+        noise: That is left, m.
+        pixel: Metres across of a pixel at 1 m.
+    """
+    with np.errstate(invalid="ignore"):
+        between = np.abs(smooth - z) > _BETWEEN * noise + _STEEP * pixel * z
+    return np.where(between, z, smooth)

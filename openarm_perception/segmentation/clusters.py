@@ -31,8 +31,8 @@ class Cluster:
         id: Its number in the label image.
         window: Rows and columns of the image around it.
         mask: (h, w) bool, its pixels within the window.
-        points: (n, 3) float32 of those pixels, without their noise, in row order, m; base frame, or the camera's where
-            its pose is not known.
+        points: (n, 3) float32 of those of its pixels that lie on a surface, without their noise, in row order, m; base
+            frame, or the camera's where its pose is not known.
         height: Of its highest place over the support, m.
         outline: What lies beyond its outline.
         shape: Whether a prism fits it.
@@ -55,7 +55,7 @@ class Cluster:
     @property
     def pixels(self) -> int:
         """How many pixels with a depth it has."""
-        return len(self.points)
+        return int(np.count_nonzero(self.mask))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +113,10 @@ def segment(
         apart = robot | ~nearer(points, background, support.noise, config.sigmas, config.least_height)
     divided = divide(points, intrinsics, support, config, apart, rgb)
     T = np.eye(4) if T_base_camera is None else T_base_camera
-    image = _Image(points, divided.even, intrinsics, support, T, robot, rgb)
+    image = _Image(points, divided.even, divided.surface, intrinsics, support, T, robot, rgb)
     label, found = divided.label, image.clusters(divided.label)
     if config.join_parts:
-        root = joined(found, divided.pieces)
+        root = joined(found, label, divided.pieces)
         _, number = np.unique(root, return_inverse=True)
         if len(found) and number.max() + 1 < len(found):
             label = np.concatenate([[0], number + 1]).astype(np.uint16)[label]
@@ -126,10 +126,11 @@ def segment(
 
 @dataclass(frozen=True, eq=False)
 class _Image:
-    """What clusters are described by; as the arguments of `segment`, and the points without noise."""
+    """What clusters are described by; as the arguments of `segment`, and points without noise as of `Divided`."""
 
     points: Points
     even: Points
+    surface: Points
     intrinsics: Intrinsics
     support: Support
     T_frame_camera: Array
@@ -145,7 +146,7 @@ class _Image:
 
     def _cluster(self, label: NDArray[np.uint16], i: int, outline: Outline, T_plane_camera: Array) -> Cluster:
         window, T = _window(label, i), self.T_frame_camera
-        mask, local, z = label[window] == i, self.even[window], self.points[window][..., 2]
+        mask, local, z = label[window] == i, self.surface[window], self.points[window][..., 2]
         other = ((label[window] != 0) & ~mask) | self.robot[window]
         depth, lens = float(np.median(z[mask])), self.intrinsics
         shape = judge(
@@ -157,7 +158,7 @@ class _Image:
         if self.rgb is not None:
             r, g, b = (int(v) for v in np.median(self.rgb[window][mask], axis=0))
             color = (r, g, b)
-        placed = local[mask] @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
+        placed = local[mask & np.isfinite(local[..., 2])] @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
         size = np.array([*shape.footprint.size, shape.height])
         T_frame_box = T @ se3.inverse(T_plane_camera) @ T_plane_box
         return Cluster(i, window, mask, placed, shape.height, outline, shape, T_frame_box, size, color)

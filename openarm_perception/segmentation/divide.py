@@ -16,7 +16,7 @@ from openarm_common.camera.flying_pixels import label_lonely
 from openarm_common.config import Config
 from openarm_common.types import Array, Bytes, Mask
 from openarm_perception.geometry.depth import Points
-from openarm_perception.geometry.patch import denoise
+from openarm_perception.geometry.patch import denoise, keep_edges
 from openarm_perception.segmentation.colors import join_alike, join_smooth
 from openarm_perception.segmentation.grouping import partition
 from openarm_perception.segmentation.kernels import (
@@ -80,6 +80,7 @@ class Divided:
         label: (h, w) uint16, 0: none; 1, 2, …: things, the largest (area) first.
         patch: (h, w) int32, the patches of surface that they are made of.
         even: (h, w, 3) points without the noise of single pixels, optical frame, m.
+        surface: (h, w, 3) such points that lie on a surface, also at its edges; NaN where a pixel floats between two.
         heights: (h, w) float32 of those over the support, m.
         pieces: Of how many pieces each thing is, which its colours alone have joined.
     """
@@ -87,6 +88,7 @@ class Divided:
     label: NDArray[np.uint16]
     patch: Labels
     even: Points
+    surface: Points
     heights: NDArray[np.float32]
     pieces: tuple[int, ...]
 
@@ -112,9 +114,8 @@ def divide(
     pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
     noise = np.float32(support.noise)
     z = points[..., 2]
-    smooth, _ = denoise(z)
-    x, y = intrinsics.rays
-    even = np.stack([x * smooth, y[:, None] * smooth, smooth], axis=-1).astype(np.float32)
+    smooth, left = denoise(z)
+    even = _points(smooth, intrinsics)
     heights = support.heights(even)
     # without the noise of single pixels, what is as low as that may be a thing
     quiet = replace(support, noise=_noise_left(heights, smooth, support.noise))
@@ -123,7 +124,8 @@ def divide(
         _above(even, heights, quiet, config.least_height, config.sigmas),
     )
     raised &= np.isfinite(z)
-    wanted = raised & ~_flying(z, pixel, support.noise)
+    flying = _flying(z, pixel, support.noise)
+    wanted = raised & ~flying
     size = _patch_size(z[wanted], pixel, support.noise, config)
     broken = breaks(points, wanted, pixel, noise)
     strength = edge_strength(masked_normals(points, wanted, max(2, size // 2), noise), wanted, max(2, size // 2))
@@ -141,7 +143,15 @@ def divide(
         root = join_smooth(root, patch, border, rgb)
         number = _number(root, patch, area, moments, support, intrinsics, config)
     pieces = tuple(len(np.unique(piece[(number == i) & (piece > 0)])) for i in range(1, int(number.max()) + 1))
-    return Divided(_filled(number[patch], np.where(raised, z, np.nan), pixel, noise), patch, even, heights, pieces)
+    label = _filled(number[patch], np.where(raised, z, np.nan), pixel, noise)
+    surface = _points(np.where(flying, np.nan, keep_edges(z, smooth, left, pixel)), intrinsics)
+    return Divided(label, patch, even, surface, heights, pieces)
+
+
+def _points(z: Array, intrinsics: Intrinsics) -> Points:
+    """Return the points (h, w, 3) of depth (h, w), optical frame, m."""
+    x, y = intrinsics.rays
+    return np.stack([x * z, y[:, None] * z, z], axis=-1).astype(np.float32)
 
 
 def _filled(label: NDArray[np.uint16], z: NDArray[np.float32], pixel: float, noise: np.float32) -> NDArray[np.uint16]:

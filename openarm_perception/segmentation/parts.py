@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 _TOUCH, _POINTS, _BOXES = 0.008, 4, 0.004
 #: Or where the one lies over the other: so much of it is within the other's outline, seen from above.
 _OVER, _ASKED = 0.3, 200
+#: Or where the one begins in the image where the other ends, so many pixels on, and no more than this is hidden between
+#: them, m: the head of a hammer hides the end of its handle.
+_NEXT, _HIDDEN = 3, 0.02
 #: A thing has no more parts than this.
 _PARTS = 3
 #: What is joined is no larger than this, m: things that a hand grasps are long or wide, not both.
@@ -35,21 +38,25 @@ _LONG, _WIDE = 0.38, 0.20
 _BODY = 0.095
 
 
-def joined(clusters: Sequence[Cluster], pieces: Sequence[int] = ()) -> Ints:
+def joined(clusters: Sequence[Cluster], label: NDArray[np.uint16], pieces: Sequence[int] = ()) -> Ints:
     """Return the group (n,) of each cluster: the index of its first one.
 
     Args:
         clusters: Of one image.
+        label: (h, w) their numbers 1, 2, … at each pixel, 0: none.
         pieces: Of how many pieces each is already; none: of one.
     """
     root = np.arange(len(clusters))
     clouds = [one.points.astype(np.float64) for one in clusters]
-    pairs = [
-        (gap, i, j)
-        for i, a in enumerate(clusters)
-        for j, b in enumerate(clusters[:i])
-        if (gap := _gap(clouds[i], clouds[j])) <= (_TOUCH if "unknown" in (a.shape.kind, b.shape.kind) else _BOXES)
-    ]
+    next_to = _next_to(label, len(clusters))
+    pairs: list[tuple[float, int, int]] = []
+    for i, a in enumerate(clusters):
+        for j, b in enumerate(clusters[:i]):
+            gap, unknown = _gap(clouds[i], clouds[j]), "unknown" in (a.shape.kind, b.shape.kind)
+            if unknown and next_to[i, j] and _nearest(clouds[i][:, :2], clouds[j][:, :2], _HIDDEN) <= _HIDDEN:
+                gap = min(gap, _TOUCH)
+            if gap <= (_TOUCH if unknown else _BOXES):
+                pairs.append((gap, i, j))
     body = [_extent(cloud)[1] > _BODY for cloud in clouds]
     heap = _heaps(pieces or (1,) * len(clusters), [(i, j) for _, i, j in pairs])
     for _, i, j in sorted(pairs):
@@ -70,21 +77,42 @@ def _heaps(pieces: Sequence[int], touching: Sequence[tuple[int, int]]) -> NDArra
     return np.bincount(label, weights=pieces, minlength=1)[label] > _PARTS
 
 
+def _next_to(label: NDArray[np.uint16], count: int) -> NDArray[np.bool_]:
+    """Return which of the things (n, n) begin in the image where others end."""
+    meet = np.zeros((count + 1, count + 1), np.int64)
+    for k in range(1, _NEXT + 1):
+        for one, other in ((label[k:], label[:-k]), (label[:, k:], label[:, :-k])):
+            differ = (one != other) & (one > 0) & (other > 0)
+            np.add.at(meet, (one[differ], other[differ]), 1)
+    return (meet + meet.T)[1:, 1:] >= _POINTS
+
+
 def _gap(a: Array, b: Array) -> float:
     """Return how far apart two clouds (n, 3) are, m; 0 where the one lies over the other."""
     (few, many) = (a, b) if len(a) < len(b) else (b, a)
-    low, high = many.min(axis=0)[:2] - _TOUCH, many.max(axis=0)[:2] + _TOUCH
-    near = few[((few[:, :2] >= low) & (few[:, :2] <= high)).all(axis=1)]
-    if len(near) < _POINTS:
-        return np.inf
-    away, _ = KDTree(many).query(near, distance_upper_bound=2.0 * _TOUCH)
-    nearest = float(np.partition(away, _POINTS - 1)[_POINTS - 1])
+    nearest = _nearest(few, many, _TOUCH)
     if nearest <= _TOUCH:
         return nearest
+    near = few[_within(few, many, _TOUCH)]
     hull = cv2.convexHull((many[:, :2] * 1e3).astype(np.float32))
     asked = near[:: max(1, len(near) // _ASKED)]
     within = [cv2.pointPolygonTest(hull, (1e3 * float(x), 1e3 * float(y)), False) >= 0.0 for x, y, _ in asked]
-    return 0.0 if np.mean(within) * len(near) >= _OVER * len(few) else np.inf
+    return 0.0 if len(near) and np.mean(within) * len(near) >= _OVER * len(few) else np.inf
+
+
+def _within(few: Array, many: Array, margin: float) -> NDArray[np.bool_]:
+    """Return which of few (n, 2 or 3) are over the rectangle about many, and a margin, m."""
+    low, high = many[:, :2].min(axis=0) - margin, many[:, :2].max(axis=0) + margin
+    return ((few[:, :2] >= low) & (few[:, :2] <= high)).all(axis=1)
+
+
+def _nearest(few: Array, many: Array, most: float) -> float:
+    """Return how far `_POINTS` of few (n, 2 or 3) are from many at most, m; inf where that is much more than `most`."""
+    near = few[_within(few, many, most)]
+    if len(near) < _POINTS:
+        return np.inf
+    away, _ = KDTree(many).query(near, distance_upper_bound=2.0 * most)
+    return float(np.partition(away, _POINTS - 1)[_POINTS - 1])
 
 
 def _fits(points: Array) -> bool:

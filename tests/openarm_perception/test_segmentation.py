@@ -262,6 +262,10 @@ def test_parts_that_touch_are_one_thing_for_a_hand_and_boxes_apart_are_two(table
     assert joined[1] > apart[2]
 
 
+#: An image in which no piece is next to another.
+APART = np.zeros((1, 1), np.uint16)
+
+
 def piece(n: float, half: float = 0.018):
     """A square piece that touches those of the next numbers."""
     edge = np.arange(-half, half + 1e-9, 0.004)
@@ -270,17 +274,45 @@ def piece(n: float, half: float = 0.018):
 
 
 def test_more_pieces_than_a_thing_has_parts_are_a_heap_and_stay_pieces():
-    assert list(joined([piece(n) for n in range(3)])) == [0, 0, 0]
-    assert list(joined([piece(n) for n in range(4)])) == [0, 1, 2, 3]
-    assert list(joined([*(piece(n) for n in range(4)), piece(8), piece(9)])) == [0, 1, 2, 3, 4, 4]
-    assert list(joined([piece(n) for n in range(3)], (1, 2, 1))) == [0, 1, 2]  # one of them was two
+    assert list(joined([piece(n) for n in range(3)], APART)) == [0, 0, 0]
+    assert list(joined([piece(n) for n in range(4)], APART)) == [0, 1, 2, 3]
+    assert list(joined([*(piece(n) for n in range(4)), piece(8), piece(9)], APART)) == [0, 1, 2, 3, 4, 4]
+    assert list(joined([piece(n) for n in range(3)], APART, (1, 2, 1))) == [0, 1, 2]  # one of them was two
+
+
+def test_pieces_with_a_gap_that_one_of_them_may_hide_are_one_thing():
+    """They are next to each other in the image, since the nearer is higher."""
+    label = np.zeros((20, 20), np.uint16)
+    label[5:15, 2:9], label[5:15, 10:18] = 1, 2
+    higher = piece(0.0)
+    higher.points = higher.points + np.array([0.0, 0.0, 0.04])
+    hidden, apart = piece(1.3), piece(1.6)
+    assert list(joined([higher, hidden], label)) == [0, 0]
+    assert list(joined([higher, hidden], APART)) == [0, 1]
+    assert list(joined([higher, apart], label)) == [0, 1]
+    both = [SimpleNamespace(points=one.points, shape=SimpleNamespace(kind="box")) for one in (higher, hidden)]
+    assert list(joined(both, label)) == [0, 1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_things_of_which_one_hides_all_that_is_between_them_are_two(tabletop, seed):
+    """A can in front of a box, 5 cm apart: pixels at its edge are no points between them."""
+    can = tabletop.Thing("green", "cylinder", (0.066, 0.066, 0.115), 0.341, -0.348)
+    box = tabletop.Thing("blue", "box", (0.066, 0.062, 0.098), 0.233, -0.417, 0.36)
+    view = tabletop.render([can, box])
+    points = seen(view, DepthNoiseConfig(enabled=True), seed)
+    config = SegmentationConfig(join_parts=True)
+    result = segment(points, view.intrinsics, config, rgb=view.rgb, T_base_camera=view.T_base_camera)
+    assert len(result.clusters) == 2
+    away = np.linalg.norm(at(result, can.x, can.y).points[:, :2] - (can.x, can.y), axis=1)
+    assert away.max() < 0.033 + 0.010
 
 
 def test_two_bodies_are_two_things_though_they_touch():
     body, other, handle = piece(0.0, half=0.06), piece(3.05, half=0.06), piece(-1.97)
-    assert list(joined([body, handle])) == [0, 0]
-    assert list(joined([body, other])) == [0, 1]
-    assert list(joined([body, other, handle])) == [0, 1, 0]
+    assert list(joined([body, handle], APART)) == [0, 0]
+    assert list(joined([body, other], APART)) == [0, 1]
+    assert list(joined([body, other, handle], APART)) == [0, 1, 0]
 
 
 @pytest.mark.parametrize(
