@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.objects.resting import least_box_middles
 from openarm_common.types import Array
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict
@@ -82,6 +83,15 @@ class Cluster:
             return True
         away, _ = KDTree(self.upper).query(before.upper)
         return float(np.median(away)) <= 2.0 * _CELL
+
+    def away_from(self, p: Array) -> float:
+        """How far its middle is from (2,) or (3,) a point, seen from above, m.
+
+        The centroid of its points is another one where more of it is seen, or a camera is nearer to a part of it.
+        """
+        middles = np.empty((0, 2)) if self.upper is None else least_box_middles(self.upper[:, :2])
+        middles = middles if len(middles) else self.centroid[None, :2]
+        return float(np.linalg.norm(middles - p[:2], axis=1).min())
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +250,7 @@ def judge_rests(
 
     Args:
         before: The thing as it was; one that was cut off proves nothing.
-        p_expected: (2,) or (3,) where its centroid should be, base frame, m; z is not read.
+        p_expected: (2,) or (3,) where its middle should be, base frame, m; z is not read.
         frames: Taken after the arm has left; the newest that shows it counts.
         tolerance: Largest horizontal distance, m.
         leaned: It may have lain on something else: it may be lower now, and look longer.
@@ -249,23 +259,24 @@ def judge_rests(
         return CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
     if before.cut:
         return CameraVerdict(
-            Code.PLACE_FAILED, "the object was cut off when it was first seen: its centroid is not known"
+            Code.PLACE_FAILED, "the object was cut off when it was first seen: its middle is not known"
         )
     reach = tolerance + 0.5 * before.extent
     cut = False
     for frame in reversed(frames):
-        near = [c for c in frame.clusters if _apart(c, p_expected) <= reach and c.points >= _SAME_THING * before.points]
+        near = [c for c in frame.clusters if c.points >= _SAME_THING * before.points]
+        near = [c for c in near if c.away_from(p_expected) <= reach]
         whole = [c for c in near if not c.cut]
         cut = cut or len(whole) < len(near)
         if whole and frame.place_in_view:
-            nearest = min(whole, key=lambda c: _apart(c, p_expected))
+            nearest = min(whole, key=lambda c: c.away_from(p_expected))
             return _compare(before, nearest, p_expected, tolerance, leaned=leaned)
     why = "is cut off by the border, the robot or another thing" if cut else "is not in view"
     return CameraVerdict(Code.PLACE_FAILED, f"the object {why} after the place: nothing shows that it stands there")
 
 
 def _compare(before: Cluster, now: Cluster, p_expected: Array, tolerance: float, *, leaned: bool) -> CameraVerdict:
-    away = _apart(now, p_expected)
+    away = now.away_from(p_expected)
     text = f"the cluster is {away * 1e3:.0f} mm from its target"
     if away > tolerance:
         return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")

@@ -452,43 +452,54 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
 def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]) -> CameraVerdict:
     """Judge what is no box by its points, and by the middle of what is seen now.
 
-    Where it was seen in part and no place was asked for, it is where it is seen to stand. Of what had turned in the
+    One image that shows it at its place is enough: of a thin thing another may show a part. Of what had turned in the
     hand nothing is said: a part that is out of view may make up for a shift.
     """
     if grasp.turned:
         text = "it had turned or slipped in the hand: nothing shows that it is where it should be"
         return CameraVerdict(Code.PLACE_FAILED, text)
+    if not cluster_of(grasp.sighting).cut:
+        torn = next((d for d in grasp.adjacent if not stands(d, frames)), None)
+        if torn is not None:
+            x, y = torn.p_base[:2]
+            text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
+            return CameraVerdict(Code.PLACE_FAILED, f"{text} is not known", final=True)
+    newest = CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
+    for age, frame in enumerate(reversed(frames)):
+        verdict = _seen_in(frame, run, grasp, placed)
+        newest = verdict if age == 0 else newest
+        if verdict.ok:
+            return verdict
+    return newest
+
+
+def _seen_in(frame: Frame, run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
+    """Judge what is no box by one image; where it was seen in part and no place was asked for, it is where it is."""
     config, before, place = run.config, cluster_of(grasp.sighting), placed.target.position
     T_base_now = placed.target.T_base_tcp @ se3.inverse(grasp.candidate.T_base_tcp)
-    rests = se3.apply(T_base_now, before.centroid)
-    now, points = nearest_to(frames, rests if before.cut else place)
+    now, points = nearest_to((frame,), se3.apply(T_base_now, before.centroid) if before.cut else place)
     seen = judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
+    tolerance = _SEEN_WITHIN * config.place.tolerance
     if not before.cut:
         # next to others it may have been several things, or have lain on one: such come apart, or fall
         leaned = any(gap(d, grasp.sighting.target) < NEXT_TO for d in grasp.sighting.others)
-        tolerance = _SEEN_WITHIN * config.place.tolerance
-        rested = judge_rests(before, rests, cluster_frames(frames, rests), tolerance, leaned=leaned)
+        rested = judge_rests(before, place, cluster_frames((frame,), place), tolerance, leaned=leaned)
         seen = seen if leaned and rested.ok else rested
-    torn = next((d for d in grasp.adjacent if not before.cut and not stands(d, frames)), None)
-    if seen.ok and torn is not None:
-        x, y = torn.p_base[:2]
-        text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
-        return CameraVerdict(Code.PLACE_FAILED, f"{text} is not known", final=True)
     whole = now is not None and now.measured
     if not seen.ok or not (before.cut or whole):
         return seen
     if now is None or not whole:
         text = "the border of the image or another thing hides a part of it: it is not known where its middle is"
         return CameraVerdict(Code.PLACE_FAILED, text)
-    if before.cut and came_next_to(now, grasp.sighting.others, frames, NEXT_TO):
+    if before.cut and came_next_to(now, grasp.sighting.others, (frame,), NEXT_TO):
         text = "what is seen next to it was not there before: it may be a part of it, and its middle is not known"
         return CameraVerdict(Code.PLACE_FAILED, text)
     if before.cut and run.request.place is None and not run.request.place_choices:
         run.place_target = replace(placed.target, position=np.array([*now.p_base[:2], place[2]]))
         return seen
     middles = np.concatenate([now.p_base[None, :2], least_box_middles(points[:, :2])])
-    off, limit = float(np.linalg.norm(middles - place[:2], axis=1).min()), _SEEN_WITHIN * config.place.tolerance
-    if off > limit:
-        text = f"its middle is seen {off * 1e3:.0f} mm from its target, expected at most {limit * 1e3:.0f} mm"
+    off = float(np.linalg.norm(middles - place[:2], axis=1).min())
+    if off > tolerance:
+        text = f"its middle is seen {off * 1e3:.0f} mm from its target, expected at most {tolerance * 1e3:.0f} mm"
         return CameraVerdict(Code.PLACE_FAILED, text)
     return seen

@@ -40,16 +40,11 @@ def clusters(view: View, localizer: Localizer) -> tuple[Detection2D, ...]:
 
 
 def _detection(cluster: Cluster) -> Detection2D:
-    """Return the detection of a cluster; holes in it, without a depth, belong to it."""
+    """Return the detection of a cluster; through a hole in it the table is seen, or the floor."""
     u, v, w, h = cv2.boundingRect(cluster.mask.astype(np.uint8))
-    part = cluster.mask[v : v + h, u : u + w].astype(np.uint8)
-    contours, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    mask = np.zeros_like(part)
-    cv2.drawContours(mask, [max(contours, key=len)], -1, 1, cv2.FILLED)
-    # what is a part of it in the image, but not in one piece, is cut off by something in front of it
-    mask |= part
+    mask = cluster.mask[v : v + h, u : u + w]
     hull = cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32))
     full = min(1.0, float(np.count_nonzero(mask)) / max(float(cv2.contourArea(hull)), 1.0))
     rows, columns = cluster.window
     centre = (columns.start + u + (w - 1) / 2.0, rows.start + v + (h - 1) / 2.0)
-    return Detection2D(ANYTHING, full, centre, (w, h), mask > 0, cluster.outline.border > 0.0, cluster=cluster)
+    return Detection2D(ANYTHING, full, centre, (w, h), mask, cluster.outline.border > 0.0, cluster=cluster)

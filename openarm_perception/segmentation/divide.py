@@ -157,7 +157,7 @@ def _points(z: Array, intrinsics: Intrinsics) -> Points:
 def _filled(label: NDArray[np.uint16], z: NDArray[np.float32], pixel: float, noise: np.float32) -> NDArray[np.uint16]:
     """Return labels (h, w) that also have the pixels next to their own: holes, and those that float.
 
-    What lies behind a thing, such as noise on the table beside its far edge, is not its own.
+    What lies behind a thing, such as noise on the table at its far edge, is not its own.
 
     Args:
         label: (h, w), 0: none.

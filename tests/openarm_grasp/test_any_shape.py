@@ -17,11 +17,12 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.evidence.verdicts import CameraVerdict
 from openarm_grasp.perception.detections import Frame, Sighting
 from openarm_grasp.perception.sightings import in_box
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.sampling.views import views_of
-from openarm_grasp.strategies import find
+from openarm_grasp.strategies import find, pick_and_place
 from openarm_grasp.strategies.registry import carry_out
 from openarm_grasp.strategies.run import Run
 
@@ -86,6 +87,20 @@ def kept_banana() -> tuple[Trials, str]:
     assert trials.link.run(carry_out(trials.grasp_task(GraspRequest("anything", phase="pick")))).success
     (arm,) = trials.session.kept
     return trials, arm
+
+
+def test_one_image_that_shows_it_at_its_place_is_enough(monkeypatch) -> None:
+    """The newest of three shows only a part of it, as it may of a thin thing."""
+    trials, _ = kept_banana()
+    seen_in, asked = pick_and_place._seen_in, list[int]()
+
+    def in_part(frame: Frame, *args) -> CameraVerdict:
+        asked.append(1)
+        return CameraVerdict(Code.PLACE_FAILED, "in part") if len(asked) == 1 else seen_in(frame, *args)
+
+    monkeypatch.setattr(pick_and_place, "_seen_in", in_part)
+    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    assert (outcome.success, outcome.attempts, len(asked)) == (True, 1, 2), outcome.message
 
 
 def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_that() -> None:

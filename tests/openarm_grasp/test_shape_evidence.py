@@ -116,10 +116,21 @@ def test_a_cluster_has_gone_only_when_a_free_view_shows_its_place_empty(frames, 
         ([], Code.STALE_DATA, "no camera frame"),
     ],
 )
-def test_a_thing_rests_where_its_centroid_is_as_high_and_as_long_as_before(frames, code, words):
+def test_a_thing_rests_where_its_middle_is_as_high_and_as_long_as_before(frames, code, words):
     verdict = judge_rests(STOOD, np.array([0.30, 0.1]), frames, 0.02)
     assert verdict.code is code
     assert words in verdict.reason
+
+
+def test_the_middle_is_that_of_the_outline_however_many_points_are_on_one_end():
+    x, y = np.meshgrid(np.linspace(0.0, 0.2, 41), np.linspace(0.0, 0.04, 9))
+    plate = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.42)])
+    one_end = np.concatenate([plate, np.repeat(plate[plate[:, 0] < 0.05], 5, axis=0)])
+    cluster = Cluster.of(one_end)
+    assert cluster.centroid[0] < 0.08
+    assert cluster.away_from(np.array([0.1, 0.02])) < 0.001
+    verdict = judge_rests(Cluster.of(plate), np.array([0.1, 0.02]), [frame(cluster)], 0.015)
+    assert verdict.ok, verdict.reason
 
 
 def test_what_was_cut_off_when_it_was_first_seen_is_never_said_to_be_placed():

@@ -10,12 +10,14 @@ import pytest
 
 from openarm_common.config import load_config
 from openarm_common.resources import config_dir
+from openarm_perception.detection.clouds import labelled_cloud
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
 from openarm_perception.detection.network import NetworkConfig
 from openarm_perception.detection.pipeline import Perceived, Pipeline, make_pipeline
-from openarm_perception.geometry.depth import DepthLimits
+from openarm_perception.geometry.depth import DepthLimits, View
+from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
 from tests.openarm_perception.onnx_file import boxes, write_network
 
 LIMITS = DepthLimits(near=0.07)
@@ -213,3 +215,32 @@ def test_what_is_no_prism_is_located_not_called_hidden(tabletop, perceive) -> No
     assert place.method == "bound"
     assert place.size == pytest.approx((0.10, 0.18, 0.03), abs=0.006)
     assert place.p_base[:2] == pytest.approx((0.315, 0.0), abs=0.004)
+
+
+@pytest.mark.parametrize("x", [0.27, -0.09], ids=["on the table", "over its edge"])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_seen_through_a_hole_is_none_of_a_things_points(tabletop, x, seed) -> None:
+    """A frame of four bars, also where it sticks out over the edge of the table: the hole shows table and floor."""
+    bar, edge = 0.012, 0.07
+    bars = [
+        (x, edge / 2, edge, bar),
+        (x, -edge / 2, edge, bar),
+        (x - edge / 2, 0.0, bar, edge),
+        (x + edge / 2, 0.0, bar, edge),
+    ]
+    view = tabletop.render([tabletop.Thing("red", "box", (a, b, bar), px, py) for px, py, a, b in bars])
+    depth = add_depth_noise(
+        view.depth.copy(), view.intrinsics.fy, DepthNoiseConfig(enabled=True), np.random.default_rng(seed)
+    )
+    seen = View(view.rgb, depth, view.intrinsics, view.T_base_camera)
+    localizer = Localizer(LocalizerConfig(), LIMITS, tabletop.table_height)
+    perceived = make_pipeline("anything", COLORS, NetworkConfig(), localizer).run(
+        seen.rgb, seen.depth, seen.intrinsics, seen.T_base_camera, None
+    )
+    assert len(perceived.boxes) == 1
+    cloud = labelled_cloud(seen, perceived.boxes, LIMITS).moved(view.T_base_camera)
+    points = cloud.points[cloud.labels == 1]
+    assert len(points) > 200
+    in_hole = np.abs(points[:, :2] - (x, 0.0)).max(axis=1) < (edge - bar) / 2 - 0.006
+    assert np.mean(in_hole) < 0.02
+    assert points[:, 2].min() > tabletop.table_height - 0.01
