@@ -458,19 +458,25 @@ def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame
     if grasp.turned:
         text = "it had turned or slipped in the hand: nothing shows that it is where it should be"
         return CameraVerdict(Code.PLACE_FAILED, text)
-    if not cluster_of(grasp.sighting).cut:
-        torn = next((d for d in grasp.adjacent if not stands(d, frames)), None)
-        if torn is not None:
-            x, y = torn.p_base[:2]
-            text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
-            return CameraVerdict(Code.PLACE_FAILED, f"{text} is not known", final=True)
     newest = CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
     for age, frame in enumerate(reversed(frames)):
         verdict = _seen_in(frame, run, grasp, placed)
-        newest = verdict if age == 0 else newest
         if verdict.ok:
-            return verdict
+            return _gone_with_it(grasp, frames) or verdict
+        newest = verdict if age == 0 else newest
     return newest
+
+
+def _gone_with_it(grasp: Grasp, frames: Sequence[Frame]) -> CameraVerdict | None:
+    """Return why the middle of what was seen whole is not known after all; None where nothing has gone with it."""
+    if cluster_of(grasp.sighting).cut:
+        return None
+    torn = next((d for d in grasp.adjacent if not stands(d, frames)), None)
+    if torn is None:
+        return None
+    x, y = torn.p_base[:2]
+    text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
+    return CameraVerdict(Code.PLACE_FAILED, f"{text} is not known", final=True)
 
 
 def _seen_in(frame: Frame, run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
