@@ -189,7 +189,8 @@ def _request(connection: socket.socket) -> list[str]:
 
 def main() -> None:
     """Answer on the inherited socket until SIGINT or SIGTERM."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):  # a shell starts what is in its background with SIGINT ignored
+        signal.signal(number, signal.default_int_handler)
     sys.stdout, sys.stderr = _ToClient("out", sys.stdout), _ToClient("err", sys.stderr)
     daemon, code = None, 0
     try:

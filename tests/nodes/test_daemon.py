@@ -71,8 +71,9 @@ class Graph:
         self.listener.listen(32)
         self.env = {**os.environ, "PYTHONPATH": str(ROOT)}
         fd = self.listener.fileno()
-        command = [sys.executable, "-m", "openarm_bringup.daemon", str(fd), str(self.domain)]
-        self.daemon = subprocess.Popen(command, env=self.env, pass_fds=(fd,))
+        # as in the background of a shell, where SIGINT is ignored
+        command = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "openarm_bringup.daemon"]
+        self.daemon = subprocess.Popen([*command, str(fd), str(self.domain)], env=self.env, pass_fds=(fd,))
 
     def close(self) -> None:
         self.daemon.send_signal(signal.SIGINT)
