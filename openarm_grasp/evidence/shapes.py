@@ -24,7 +24,7 @@ from openarm_grasp.evidence.verdicts import CameraVerdict
 #: A thing that rests as it rested is as high as before, m, or to this share of its height.
 _HEIGHT, _HEIGHT_SHARE = 0.008, 0.08
 #: Its largest horizontal extent is as before, m, or to this share of it: another view sees other sides.
-_EXTENT, _EXTENT_SHARE = 0.015, 0.25
+_EXTENT, _EXTENT_SHARE = 0.015, 0.15
 #: A cluster with a smaller share of the points of the thing is a remainder of something else.
 _SAME_THING = 0.3
 #: What is lower than the thing was, by so much, m, or by this share of its height, is something else.

@@ -71,7 +71,7 @@ class Placed:
         target: Where.
         gripper: That the hand held it above that place.
         reason: How it was put down.
-        failure: Why it was put back where it came from; None when it was put where it belongs.
+        failure: Why it was put back where it came from, or let go on the way; None when it was put where it belongs.
     """
 
     target: PlaceTarget

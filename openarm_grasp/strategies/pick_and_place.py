@@ -20,10 +20,11 @@ from openarm_common import se3
 from openarm_common.detection import gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.objects.resting import least_box_middles
+from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.shapes import heavier_end, judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
-from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
+from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict, Verdict
 from openarm_grasp.perception.clouds import (
     came_next_to,
     cluster_frames,
@@ -348,7 +349,8 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
     ways, failure = grasp.places, None
     while True:
         try:
-            return replace(await _put_down(run, grasp, ways, why), failure=failure)
+            placed = await _put_down(run, grasp, ways, why)
+            return placed if failure is None else replace(placed, failure=failure)
         except OpenArmError as error:
             reraise_stop(error)
             if error.code is Code.GRASP_LOST:
@@ -362,7 +364,10 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
             why = f"{error.message}; putting it back"
         run.place_target = None
         target = grasp.sighting.target
-        ways = place_targets(target, grasp.candidate, (target.p_base[:2],), run.config)
+        back = place_targets(target, grasp.candidate, (target.p_base[:2],), run.config)
+        # first from where the lift has brought it: it has come that way, between things that stand close to it
+        lifted = grasp.candidate.retreat_offset
+        ways = (*(replace(way, id=f"{way.id}/lifted", approach_offset=lifted) for way in back), *back)
 
 
 async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> Placed:
@@ -379,7 +384,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
         if not gripper.ok:
             raise OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}")
         run.enter(State.PLACE, gripper.reason)
-        await _lower(run, grasp, plan, target)
+        failure = await _lower(run, grasp, plan, target)
         await robot.open(arm, "release", grasp.candidate.opened)
     except OpenArmError as error:
         if error.code is Code.GRASP_LOST:
@@ -399,14 +404,17 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
         reason = error.message
     else:
         run.hand = Hand.CLEAR
-    return Placed(target, gripper, reason)
+    return Placed(target, gripper, reason, failure)
 
 
-async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget) -> None:
-    """Go down to the place; what meets something a little above it is let go there.
+async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget) -> Verdict | None:
+    """Go down to the place; what meets something a little above it is let go there, what a hand kept anywhere.
+
+    Returns:
+        Why it is not where it should be, when it was let go higher up; None, when it is.
 
     Raises:
-        OpenArmError: EXECUTION_FAILED, when it meets something higher up.
+        OpenArmError: EXECUTION_FAILED, when it meets something higher up, and may be put back yet.
     """
     try:
         await run.robot.follow(grasp.arm, plan.approach, "put down", carrying=True)
@@ -414,9 +422,13 @@ async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget) -> 
         if error.code is not Code.EXECUTION_FAILED:
             raise
         above = float((run.robot.T_base_tcp(grasp.arm) - target.T_base_tcp)[2, 3])
-        if above > _MET_AT and not grasp.turned:
+        high = above > _MET_AT and not grasp.turned
+        if high and run.kept is None:
             raise
-        run.robot.warn(f"{error.message}: what the hand holds meets something below, and is let go there")
+        text = f"{error.message}: what the hand holds meets something below, and is let go there"
+        run.robot.warn(text)
+        return run.fail(Code.PLACE_FAILED, f"{text}, {above * 1e3:.0f} mm above its place") if high else None
+    return None
 
 
 # --- verify
@@ -467,6 +479,11 @@ def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame
     return newest
 
 
+def _centroid_off(points: Array, p_expected: Array) -> float:
+    """How far the centroid of points (n, 3) is from where it should be, seen from above, m."""
+    return float(np.linalg.norm(points[:, :2].mean(axis=0) - p_expected[:2]))
+
+
 def _gone_with_it(grasp: Grasp, frames: Sequence[Frame]) -> CameraVerdict | None:
     """Return why the middle of what was seen whole is not known after all; None where nothing has gone with it."""
     if cluster_of(grasp.sighting).cut:
@@ -490,7 +507,9 @@ def _seen_in(frame: Frame, run: Run, grasp: Grasp, placed: Placed) -> CameraVerd
         # next to others it may have been several things, or have lain on one: such come apart, or fall
         leaned = any(gap(d, grasp.sighting.target) < NEXT_TO for d in grasp.sighting.others)
         rested = judge_rests(before, place, cluster_frames((frame,), place), tolerance, leaned=leaned)
-        seen = seen if leaned and rested.ok else rested
+        # next to what was left behind the middle of both may be where that of one thing and the other should be
+        near = now is not None and _centroid_off(points, se3.apply(T_base_now, before.centroid)) <= tolerance
+        seen = rested if not rested.ok or (near and not leaned) else seen
     whole = now is not None and now.measured
     if not seen.ok or not (before.cut or whole):
         return seen

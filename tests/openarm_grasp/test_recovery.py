@@ -332,6 +332,27 @@ def test_what_meets_something_just_above_its_place_is_let_go_there(world, above,
     assert outcome.attempts == (1 if let_go else 2)
 
 
+@pytest.mark.requirement("R-17")
+def test_what_a_hand_kept_is_let_go_where_it_meets_something_and_taken_from_there(world):
+    """It hangs lower than it should, and would block the hand for every order to come."""
+    assert world.grasp(phase="pick").success
+    assert list(world.session.kept) == ["right"]
+
+    def hand(arm):
+        plans = world.done(PlanPlace)
+        return se3.make(p=(0.0, 0.0, 0.05)) @ (
+            plans[-1].targets[0].T_base_tcp if plans else se3.make(p=(0.26, 0.2, 0.6))
+        )
+
+    world.T_base_tcp = hand
+    world.fail(world.follows_path("put down"), Code.EXECUTION_FAILED, times=1)
+    outcome = world.grasp(phase="place")
+    assert outcome.success, outcome.message
+    assert outcome.attempts == 2
+    assert not world.session.kept
+    assert any("50 mm above its place" in status.reason for status in world.status)
+
+
 def test_what_a_hand_holds_and_meets_something_on_its_way_back_is_let_go_there(world):
     world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN, times=1)
     world.lifted = lambda label: None  # it is still seen in its place
