@@ -349,7 +349,7 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
     ways, failure = grasp.places, None
     while True:
         try:
-            placed = await _put_down(run, grasp, ways, why)
+            placed = await _put_down(run, grasp, ways, why, last=run.kept is not None or failure is not None)
             return placed if failure is None else replace(placed, failure=failure)
         except OpenArmError as error:
             reraise_stop(error)
@@ -370,8 +370,16 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
         ways = (*(replace(way, id=f"{way.id}/lifted", approach_offset=lifted) for way in back), *back)
 
 
-async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> Placed:
-    """Plan, carry, see that the hand still holds the object, put it down, let go, leave."""
+async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str, *, last: bool) -> Placed:
+    """Plan, carry, see that the hand still holds the object, put it down, let go, leave.
+
+    Args:
+        run: The request.
+        grasp: What holds it.
+        ways: To put it down.
+        why: For the report.
+        last: The hand keeps it when this fails: it is let go where it meets something on its way down, too.
+    """
     arm, robot, config = grasp.arm, run.robot, run.config
     plan, target = await plan_place(run, grasp, ways, why)
     if ways is grasp.places:
@@ -384,7 +392,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
         if not gripper.ok:
             raise OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}")
         run.enter(State.PLACE, gripper.reason)
-        failure = await _lower(run, grasp, plan, target)
+        failure = await _lower(run, grasp, plan, target, last=last)
         await robot.open(arm, "release", grasp.candidate.opened)
     except OpenArmError as error:
         if error.code is Code.GRASP_LOST:
@@ -407,8 +415,8 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
     return Placed(target, gripper, reason, failure)
 
 
-async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget) -> Verdict | None:
-    """Go down to the place; what meets something a little above it is let go there, what a hand kept anywhere.
+async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget, *, last: bool) -> Verdict | None:
+    """Go down to the place; what meets something a little above it is let go there, at the last try anywhere.
 
     Returns:
         Why it is not where it should be, when it was let go higher up; None, when it is.
@@ -423,7 +431,7 @@ async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget) -> 
             raise
         above = float((run.robot.T_base_tcp(grasp.arm) - target.T_base_tcp)[2, 3])
         high = above > _MET_AT and not grasp.turned
-        if high and run.kept is None:
+        if high and not last:
             raise
         text = f"{error.message}: what the hand holds meets something below, and is let go there"
         run.robot.warn(text)
