@@ -124,7 +124,7 @@ class Trials:
         labels, clear = self._task.labels, self._task.clear
         if not clear and len(set(labels)) < len(labels):  # the same object more than once
             return [self._grasp(GraspRequest(label)) for label in labels]
-        order, placed, open_ = Order(labels, each=Counter(labels)), list[Trial](), dict[object, Trial]()
+        order, placed, open_ = Order(labels, each=0 if clear else Counter(labels)), list[Trial](), dict[object, Trial]()
         while ask := order.next():
             trial = self._grasp(ask)
             answer, touched = trial.answer, trial.answer.attempts > 0
@@ -143,7 +143,9 @@ class Trials:
                 open_[label] = trial
             if touched and not clear:  # three attempts are what a scene may take
                 order.failed[label] = answer.message
-        self._left, missing = order.faults(), len(labels) - len(placed)
+        # what was taken twice does not count for two
+        done = len({trial.target for trial in placed}) if clear else len(placed)
+        self._left, missing = order.faults(), len(labels) - done
         last = [open_[key] for key in (*order.left, *order.failed) if key in open_] or list(open_.values())
         # what nothing was asked about was not seen: the last answer says so
         return [*placed, *(last + last[-1:] * missing)[:missing]]

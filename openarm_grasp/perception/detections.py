@@ -30,6 +30,8 @@ SAME_PLACE = 0.05
 NEXT_TO = 0.03
 #: Where the middle of an object is that is not asked for, what has that in its box is a part of it, or nearly, m.
 _PART = 0.01
+#: What has its middle this near to a point of something is a piece of that, m.
+_ON = 0.015
 #: Clouds of so many frames are enough.
 _CLOUDS = 3
 #: What lies this near to points of an object is a piece of it, m.
@@ -174,6 +176,7 @@ def find(
     *,
     at: Sequence[float] | None = None,
     exclude_near: Sequence[Sequence[float]] = (),
+    exclude_parts: Sequence[Array] = (),
     same: Sighting | None = None,
 ) -> Sighting:
     """Follow one object through all frames and average it.
@@ -184,6 +187,7 @@ def find(
         limits: How near detections must be to be one object, and how much it may seem to move.
         at: (x, y) where it stands, m; None: anywhere.
         exclude_near: (x, y) of objects that are excluded, m.
+        exclude_parts: (n, 2) where points of them are, m.
         same: The object as it was seen or left before: it is looked for alone, whatever the words fit now.
 
     Raises:
@@ -193,7 +197,7 @@ def find(
             UNKNOWN_OBJECT, naming what is in view; STALE_DATA, when the object was not in the newest frame and two
             thirds of all, or moved between them.
     """
-    anchor = _same(frames, same) if same else _anchor(in_view(frames, label), label, at, exclude_near)
+    anchor = _same(frames, same) if same else _anchor(in_view(frames, label), label, at, exclude_near, exclude_parts)
     track, clouds = _track(frames, anchor, limits.match_radius, in_part=False)
     if 3 * len(track) < 2 * len(frames):
         parts, theirs = _track(frames, anchor, limits.match_radius, in_part=True)
@@ -306,11 +310,17 @@ def _same(frames: Sequence[Frame], before: Sighting) -> Detection:
 
 
 def _anchor(
-    fitting: Sequence[Detection], label: str, at: Sequence[float] | None, exclude_near: Sequence[Sequence[float]]
+    fitting: Sequence[Detection],
+    label: str,
+    at: Sequence[float] | None,
+    exclude_near: Sequence[Sequence[float]],
+    exclude_parts: Sequence[Array],
 ) -> Detection:
     """The detection of the object that is asked for."""
     name = label or "the object"
     stay = _excluded(fitting, exclude_near)
+    # a thin thing may be seen in pieces
+    stay |= [any(np.linalg.norm(part - d.p_base[:2], axis=1).min() <= _ON for part in exclude_parts) for d in fitting]
     chosen = [d for d, stays in zip(fitting, stay, strict=True) if not stays]
     if not chosen:
         raise OpenArmError(

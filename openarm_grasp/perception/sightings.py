@@ -67,7 +67,8 @@ def divided(found: Sighting, left: NDArray[np.bool_]) -> Sighting:
         labels = cloud.labels.copy()
         labels[mine[left[begin : begin + len(mine)]]] = 2
         begin += len(mine)
-        clouds.append(replace(cloud, labels=labels))
+        if (labels == 1).any():  # what of it this one showed may all have been the other
+            clouds.append(replace(cloud, labels=labels))
     points, whole = object_points(found.clouds), (found.target,)
     target, rest = (_about(found.target, part, whole) for part in (points[~left], points[left]))
     return replace(found, target=target, others=(*found.others, rest), clouds=tuple(clouds))

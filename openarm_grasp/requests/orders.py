@@ -20,6 +20,7 @@ from pydantic import Field, model_validator
 from openarm_common.config import Config, Interval, load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.wanted import EASIEST, takes_all
+from openarm_grasp.perception.detections import SAME_PLACE
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.request import GraspRequest
 
@@ -292,7 +293,7 @@ class Order:
         if placing and code is Code.NOT_READY:
             return None  # no hand holds anything: it is where it was seen last
         if code is Code.OK:
-            self._place(label, placed, placing=placing)
+            self._place(label, placed, seen, placing=placing)
             return None
         if (placing and held) or code in (*_OVER, Code.INVALID_ARGUMENT):
             self.failed[label] = f"{code}: {message}"
@@ -315,14 +316,20 @@ class Order:
             return None
         return self._leave(Left(label, where, code, message, after))
 
-    def _place(self, label: str, placed: Sequence[float], *, placing: bool) -> None:
-        """Note that an object of a label was placed."""
+    def _place(self, label: str, placed: Sequence[float], seen: Sequence[float] | None, *, placing: bool) -> None:
+        """Note that an object of a label was placed; what was placed before, and is seen in pieces, was so in vain."""
         if placing and self.left:
             self.left.pop()  # what was left in the hand
-        self._in_vain, self._before = [], []
-        self.placed.append(label)
+        again = [] if seen is None else [spot for spot in self._stand if math.dist(spot, seen[:2]) < SAME_PLACE]
+        self._stand = [spot for spot in self._stand if spot not in again]
         if len(placed) >= 2:
             self._stand.append((float(placed[0]), float(placed[1])))
+        if again:
+            if self._given_up:
+                self._asked.add(label)
+            return
+        self._in_vain, self._before = [], []
+        self.placed.append(label)
         if self._enough(label):
             self.left = [one for one in self.left if one.label != label]
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import LONGEST_TEXT, check_length
+from openarm_common.types import Array
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.perception.detections import Frame, Sighting, find
@@ -40,6 +41,7 @@ class GraspRequest:
         timeout: s of robot time for all of it; 0: none.
         object_at: (x, y) near which the object is, base frame, m; None: any that is called so.
         exclude_near: (x, y) of objects that stay where they are, base frame, m.
+        exclude_parts: (n, 2) where points of such objects are, as far as known, base frame, m.
         place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
         why: What it is for, when it is a part of another request.
         same: The object, when an earlier part of the request was about it: as it was seen or left then.
@@ -55,6 +57,7 @@ class GraspRequest:
     timeout: float = 0.0
     object_at: tuple[float, ...] | None = None
     exclude_near: tuple[tuple[float, float], ...] = ()
+    exclude_parts: tuple[Array, ...] = ()
     place_choices: tuple[tuple[float, float], ...] = ()
     why: str = ""
     same: Sighting | None = None
@@ -65,7 +68,15 @@ class GraspRequest:
 
     def find(self, frames: Sequence[Frame], limits: DetectConfig) -> Sighting:
         """The object in frames of the base frame; errors as `perception.detections.find`."""
-        return find(frames, self.label, limits, at=self.object_at, exclude_near=self.exclude_near, same=self.same)
+        return find(
+            frames,
+            self.label,
+            limits,
+            at=self.object_at,
+            exclude_near=self.exclude_near,
+            exclude_parts=self.exclude_parts,
+            same=self.same,
+        )
 
     def cut(self) -> GraspRequest:
         """The request with its texts cut where they are too long to be accepted."""

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -25,6 +28,9 @@ from openarm_grasp.requests.states import State
 
 if TYPE_CHECKING:
     from openarm_grasp.robot.skills import Skills
+
+#: Objects whose places are remembered; edge of a cell of their points; what is nearer to a place is there, m.
+_REMEMBERED, _CELL, _SAME_SPOT = 50, 0.01, 0.02
 
 
 # --- what outlives a request
@@ -51,6 +57,10 @@ class Grasp:
     turned: bool = False
     heavy: Array | None = None
     adjacent: tuple[Detection, ...] = ()
+
+    def motion_to(self, target: PlaceTarget) -> Array:
+        """(4, 4) how the hand moves the object from where it takes hold of it to a place, base frame."""
+        return target.T_base_tcp @ se3.inverse(self.candidate.T_base_tcp)
 
     @property
     def of_cloud(self) -> bool:
@@ -93,6 +103,23 @@ class GraspSession:
         self.drift = DriftWatch(context.config.drift, context.config.camera)
         #: What hands kept when their requests ended, by arm.
         self.kept: dict[str, Grasp] = {}
+        #: (x, y) of the newest objects that were placed, and where their points are (n, 2), m.
+        self._placed: list[tuple[Array, Array]] = []
+
+    def note_placed(self, position: Array, points: Array) -> None:
+        """Remember where an object was placed.
+
+        Args:
+            position: (2,) or (3,) base frame, m.
+            points: (n, 3) of it, as far as known.
+        """
+        cells = np.unique(np.round(points[:, :2] / _CELL), axis=0) * _CELL
+        self._placed = [*self._placed[1 - _REMEMBERED :], (position[:2], cells)]
+
+    def parts_of(self, stay: Sequence[Sequence[float]]) -> tuple[Array, ...]:
+        """Return where points (n, 2) of objects are that were placed at some of the positions (x, y), m."""
+        placed = (one for one in self._placed if len(one[1]))
+        return tuple(cells for p, cells in placed if any(np.linalg.norm(p - q[:2]) < _SAME_SPOT for q in stay))
 
     def check_hands(self, robot: Skills, request: GraspRequest) -> None:
         """Refuse what would drop an object that an ended request left in a hand; forget one that is gone.

@@ -17,28 +17,17 @@ from dataclasses import replace
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.detection import gap
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.objects.resting import least_box_middles
-from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
-from openarm_grasp.evidence.shapes import heavier_end, judge_gone, judge_held, judge_moved, judge_rests, judge_unmoved
+from openarm_grasp.evidence.shapes import heavier_end, judge_gone, judge_held, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict, Verdict
-from openarm_grasp.perception.clouds import (
-    came_next_to,
-    cluster_frames,
-    cluster_of,
-    lifted,
-    nearest_to,
-    risen_points,
-    stands,
-)
-from openarm_grasp.perception.detections import NEXT_TO, Frame, apart
+from openarm_grasp.perception.clouds import cluster_frames, cluster_of, lifted, nearest_to, risen_points
+from openarm_grasp.perception.detections import Frame, apart
 from openarm_grasp.perception.sightings import object_points, points_around
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.neighbours import columns
-from openarm_grasp.planning.place import place_targets, placing_error
+from openarm_grasp.planning.place import place_targets
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.requests.states import Hand, State
 from openarm_grasp.requests.task import Grasp, Placed, Task
@@ -48,13 +37,12 @@ from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_pla
 from openarm_grasp.strategies.retreat import retreat, still_held
 from openarm_grasp.strategies.run import Run
 from openarm_grasp.strategies.second_look import second_look
+from openarm_grasp.strategies.verify import verify
 
 #: After these another observation would wait for frames that do not come.
 _BLIND = (Code.NOT_READY, Code.STALE_DATA, Code.TIMEOUT)
 #: Frames that must not show the object in its old place after the lift: a detector may miss it in one.
 _LIFT_FRAMES = 2
-#: Share of the tolerance of a place in which the middle of any shape must be seen: it may be millimetres elsewhere.
-_SEEN_WITHIN = 0.75
 #: What meets something on its way down to its place is let go this high above it, m; what has turned, anywhere.
 _MET_AT = 0.015
 
@@ -132,6 +120,8 @@ async def _attempts(run: Run) -> GraspOutcome:
         if placed is not None and placed.failure is None:
             seen = await verify(run, grasp, placed)
             if seen.ok:
+                points = se3.apply(grasp.motion_to(placed.target), object_points(grasp.sighting.clouds))
+                run.task.session.note_placed((run.place_target or placed.target).position, points)
                 text = f"{seen.reason}, placed by the {run.arm} arm"
                 return succeeded(run, text, gripper=placed.gripper, camera=seen)
             run.failure = seen
@@ -437,102 +427,3 @@ async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget, *, 
         run.robot.warn(text)
         return run.fail(Code.PLACE_FAILED, f"{text}, {above * 1e3:.0f} mm above its place") if high else None
     return None
-
-
-# --- verify
-async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
-    """Judge by the camera, from home, whether the object is at its place.
-
-    Raises:
-        OpenArmError: PLACE_FAILED, when no frame comes.
-    """
-    config, robot, text = run.config, run.robot, "home; observing the place"
-    frames: tuple[Frame, ...] = ()
-    for _ in range(config.detect.attempts):
-        run.enter(State.RESET, text)
-        try:
-            frames = (await robot.observe(config.detect.frames)).frames
-        except OpenArmError as error:
-            reraise_stop(error)
-            raise OpenArmError(Code.PLACE_FAILED, f"put down, but not seen since: {error.message}") from error
-        if any(d.label == run.label for frame in frames for d in frame.detections):
-            break
-        text = f"{run.label!r} is not in view after the place; observing again"
-    if grasp.of_cloud:
-        return _verify_shape(run, grasp, placed, frames)
-    error = placing_error(run.label, placed.target, frames[-1]) if frames else None
-    if error is not None:
-        run.task.session.drift.add(run.arm, *error)
-    p_target, yaw = placed.target.position, run.request.place_yaw
-    height, footprint = (None, None) if run.size is None else (float(run.size[2]), run.size[:2])
-    tolerance = config.place.tolerance
-    return verdicts.judge_place(run.label, p_target, frames, tolerance, yaw, height, footprint)
-
-
-def _verify_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]) -> CameraVerdict:
-    """Judge what is no box by its points, and by the middle of what is seen now.
-
-    One image that shows it at its place is enough: of a thin thing another may show a part. Of what had turned in the
-    hand nothing is said: a part that is out of view may make up for a shift.
-    """
-    if grasp.turned:
-        text = "it had turned or slipped in the hand: nothing shows that it is where it should be"
-        return CameraVerdict(Code.PLACE_FAILED, text)
-    newest = CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
-    for age, frame in enumerate(reversed(frames)):
-        verdict = _seen_in(frame, run, grasp, placed)
-        if verdict.ok:
-            return _gone_with_it(grasp, frames) or verdict
-        newest = verdict if age == 0 else newest
-    return newest
-
-
-def _centroid_off(points: Array, p_expected: Array) -> float:
-    """How far the centroid of points (n, 3) is from where it should be, seen from above, m."""
-    return float(np.linalg.norm(points[:, :2].mean(axis=0) - p_expected[:2]))
-
-
-def _gone_with_it(grasp: Grasp, frames: Sequence[Frame]) -> CameraVerdict | None:
-    """Return why the middle of what was seen whole is not known after all; None where nothing has gone with it."""
-    if cluster_of(grasp.sighting).cut:
-        return None
-    torn = next((d for d in grasp.adjacent if not stands(d, frames)), None)
-    if torn is None:
-        return None
-    x, y = torn.p_base[:2]
-    text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
-    return CameraVerdict(Code.PLACE_FAILED, f"{text} is not known", final=True)
-
-
-def _seen_in(frame: Frame, run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
-    """Judge what is no box by one image; where it was seen in part and no place was asked for, it is where it is."""
-    config, before, place = run.config, cluster_of(grasp.sighting), placed.target.position
-    T_base_now = placed.target.T_base_tcp @ se3.inverse(grasp.candidate.T_base_tcp)
-    now, points = nearest_to((frame,), se3.apply(T_base_now, before.centroid) if before.cut else place)
-    seen = judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
-    tolerance = _SEEN_WITHIN * config.place.tolerance
-    if not before.cut:
-        # next to others it may have been several things, or have lain on one: such come apart, or fall
-        leaned = any(gap(d, grasp.sighting.target) < NEXT_TO for d in grasp.sighting.others)
-        rested = judge_rests(before, place, cluster_frames((frame,), place), tolerance, leaned=leaned)
-        # next to what was left behind the middle of both may be where that of one thing and the other should be
-        near = now is not None and _centroid_off(points, se3.apply(T_base_now, before.centroid)) <= tolerance
-        seen = rested if not rested.ok or (near and not leaned) else seen
-    whole = now is not None and now.measured
-    if not seen.ok or not (before.cut or whole):
-        return seen
-    if now is None or not whole:
-        text = "the border of the image or another thing hides a part of it: it is not known where its middle is"
-        return CameraVerdict(Code.PLACE_FAILED, text)
-    if before.cut and came_next_to(now, grasp.sighting.others, (frame,), NEXT_TO):
-        text = "what is seen next to it was not there before: it may be a part of it, and its middle is not known"
-        return CameraVerdict(Code.PLACE_FAILED, text)
-    if before.cut and run.request.place is None and not run.request.place_choices:
-        run.place_target = replace(placed.target, position=np.array([*now.p_base[:2], place[2]]))
-        return seen
-    middles = np.concatenate([now.p_base[None, :2], least_box_middles(points[:, :2])])
-    off = float(np.linalg.norm(middles - place[:2], axis=1).min())
-    if off > tolerance:
-        text = f"its middle is seen {off * 1e3:.0f} mm from its target, expected at most {tolerance * 1e3:.0f} mm"
-        return CameraVerdict(Code.PLACE_FAILED, text)
-    return seen

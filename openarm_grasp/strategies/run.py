@@ -33,7 +33,8 @@ class Run:
     """
 
     def __init__(self, task: Task, request: GraspRequest, kept: Grasp | None) -> None:
-        self.task, self.request, self.kept = task, request, kept
+        self.task, self.kept = task, kept
+        self.request = replace(request, exclude_parts=task.session.parts_of(request.exclude_near))
         self.robot, self.context, self.config = task.robot, task.context, task.context.config
         self.began_ns = task.robot.now_ns
         self.state = State.IDLE

@@ -22,7 +22,7 @@ from openarm_grasp.perception.detections import Frame, Sighting
 from openarm_grasp.perception.sightings import in_box
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.sampling.views import views_of
-from openarm_grasp.strategies import find, pick_and_place
+from openarm_grasp.strategies import find, verify
 from openarm_grasp.strategies.registry import carry_out
 from openarm_grasp.strategies.run import Run
 
@@ -78,6 +78,20 @@ def test_what_a_hand_keeps_is_judged_by_its_points_where_it_is_placed_later() ->
     assert "the cluster is" in outcome.message
 
 
+def test_where_the_points_of_what_was_placed_are_is_remembered() -> None:
+    senses = SimulatedSenses(depth_noise=True, detector="anything")
+    trials = Trials(Task("nominal", 1, alone("banana", 0.27, -0.22, 0.4), ("anything",)), senses, GraspConfig())
+    trials.robot.pass_time(0.5)
+    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("anything"))))
+    assert outcome.success, outcome.message
+    place = outcome.place_position[:2]
+    (points,) = trials.session.parts_of((place,))
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    assert np.linalg.norm(middle - place) < 0.03
+    assert 0.10 < np.linalg.norm(np.ptp(points, axis=0)) < 0.25
+    assert trials.session.parts_of(((place[0] + 0.05, place[1]),)) == ()
+
+
 def kept_banana() -> tuple[Trials, str]:
     """Pick the banana; returns the arm that holds it."""
     senses = SimulatedSenses(depth_noise=True, detector="anything")
@@ -92,13 +106,13 @@ def kept_banana() -> tuple[Trials, str]:
 def test_one_image_that_shows_it_at_its_place_is_enough(monkeypatch) -> None:
     """The newest of three shows only a part of it, as it may of a thin thing."""
     trials, _ = kept_banana()
-    seen_in, asked = pick_and_place._seen_in, list[int]()
+    seen_in, asked = verify._seen_whole, list[int]()
 
     def in_part(frame: Frame, *args) -> CameraVerdict:
         asked.append(1)
         return CameraVerdict(Code.PLACE_FAILED, "in part") if len(asked) == 1 else seen_in(frame, *args)
 
-    monkeypatch.setattr(pick_and_place, "_seen_in", in_part)
+    monkeypatch.setattr(verify, "_seen_whole", in_part)
     outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
     assert (outcome.success, outcome.attempts, len(asked)) == (True, 1, 2), outcome.message
 

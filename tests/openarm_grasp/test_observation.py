@@ -183,6 +183,16 @@ def test_a_part_of_what_must_stay_is_not_picked() -> None:
     assert look(frames((handle, other)), exclude_near=((0.33, -0.185),)).target.p_base[1] == pytest.approx(-0.1)
 
 
+def test_a_piece_of_what_must_stay_is_not_picked_however_far_from_its_middle() -> None:
+    end = seen(x=0.30, y=-0.08, size=(0.02, 0.05, 0.01))
+    beside = seen(x=0.34, y=-0.08, size=(0.02, 0.05, 0.01), score=0.8)
+    whole = np.column_stack([np.full(20, 0.30), np.linspace(-0.25, -0.06, 20)])
+    stay = ((0.30, -0.155),)
+    assert look(frames((end, beside)), exclude_near=stay).target.p_base[0] == pytest.approx(0.30)
+    found = look(frames((end, beside)), exclude_near=stay, exclude_parts=(whole,))
+    assert found.target.p_base[0] == pytest.approx(0.34)
+
+
 def test_what_stands_close_to_what_must_stay_is_picked() -> None:
     left, close = seen(x=0.20, size=(0.02, 0.02, 0.05)), seen(x=0.235, score=0.8, size=(0.02, 0.02, 0.05))
     assert look(frames((left, close)), exclude_near=((0.203, -0.2),)).target.p_base[0] == pytest.approx(0.235)

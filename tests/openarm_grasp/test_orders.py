@@ -287,6 +287,21 @@ def test_what_was_placed_is_not_asked_for_again_by_another_word():
 
 
 @pytest.mark.requirement("R-17")
+def test_what_was_placed_and_is_taken_again_by_a_piece_of_it_counts_once_and_does_not_go_on_for_ever():
+    order, at = Order(("anything",)), (0.3, 0.2)
+    order.done(order.next(), Code.OK, "", at, (0.3, 0.0))
+    for n in range(100):
+        if (ask := order.next()) is None:
+            break
+        to = (0.3, 0.2 + 0.1 * (n % 2))
+        order.done(ask, Code.OK, "", to, at, touched=True)
+        at = to
+        assert order.next() is None or order.next().exclude_near == (at,)
+    assert order.next() is None
+    assert (order.placed, order.outcome) == (["anything"], "SUCCESS")
+
+
+@pytest.mark.requirement("R-17")
 def test_an_order_ends_though_things_seem_to_stand_elsewhere_each_time():
     order, rng, asked = Order(("anything",)), np.random.default_rng(0), 0
     while ask := order.next():

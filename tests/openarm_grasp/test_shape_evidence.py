@@ -316,6 +316,19 @@ def test_what_was_taken_for_a_part_and_stays_is_another_thing():
 
 
 @pytest.mark.requirement("R-16")
+def test_an_image_that_showed_only_what_stays_shows_nothing_of_the_thing():
+    points = np.concatenate([HANDLE, HEAD]).astype(np.float32)
+    both = LabelledCloud(points, np.ones(len(points), np.uint32), OVER)
+    stays = LabelledCloud(HEAD.astype(np.float32), np.ones(len(HEAD), np.uint32), OVER)
+    found = Sighting(boxed(points.astype(np.float64)), (), 0, (both, stays))
+    T = se3.make(p=(0.0, 0.0, 0.12))
+    risen = se3.apply(T, HANDLE)
+    thing = lifted(seen(risen, HEAD), found, risen, T, GRIP)
+    assert len(thing.clouds) == 1
+    assert len(object_points(thing.clouds)) == len(HANDLE)
+
+
+@pytest.mark.requirement("R-16")
 def test_what_the_hand_hides_belongs_to_what_is_nearest_to_it():
     points = np.concatenate([HANDLE, HEAD]).astype(np.float32)
     both = boxed(points.astype(np.float64))
