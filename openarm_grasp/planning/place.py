@@ -15,7 +15,7 @@ from math import hypot, inf
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.detection import Detection
+from openarm_common.detection import Detection, distances_from
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.work import Table
 from openarm_common.types import Array
@@ -147,12 +147,14 @@ def free_spots(
     config: GraspConfig,
     shoulders: Shoulders,
     choices: Sequence[Sequence[float]] = (),
+    *,
+    every: bool = False,
 ) -> tuple[Array, ...]:
     """Free spots, best first: of those that may be chosen, or anywhere on the arm's side of the table.
 
-    A spot keeps its distance from every other object and from where the object came. Those come first that leave room
-    for a hand around the others; among them, room around it counts (up to twice the distance asked for) and nearness to
-    where it came from, which keeps the carry short.
+    A spot keeps its distance from every other object and from where the object came. Those come first where it fits in
+    whatever its turn, then those that leave room for a hand around the others; among them, room around it counts (up to
+    twice the distance asked for) and nearness to where it came from, which keeps the carry short.
 
     Args:
         arm: Whose side.
@@ -161,6 +163,7 @@ def free_spots(
         config: Parameters.
         shoulders: Of the arms.
         choices: (x, y) of spots, base frame, m; none: a grid on the arm's side.
+        every: As many as there are, not only `config.place.spots`.
 
     Raises:
         OpenArmError: PLACE_FAILED, when nothing is free.
@@ -168,8 +171,9 @@ def free_spots(
     place = config.place
     ys = np.concatenate([grid(*place.region_abs_y, place.spot_step) * side for side in sides(arm, shoulders)])
     spots = choices or [*product(grid(*place.region_x, place.spot_step), ys)]
+    reach = 0.5 * float(np.hypot(*target.size[:2]))
     ranked = [
-        (clearance < place.neighbour_room, cost, x, y)
+        (_room((x, y), others) < reach, clearance < place.neighbour_room, cost, x, y)
         for cost, clearance, x, y in clear_spots(spots, target, others, place)
     ]
     if not ranked:
@@ -181,13 +185,18 @@ def free_spots(
         )
     # Six spots side by side would share one fate, so those offered lie apart.
     chosen: list[Array] = []
-    for _, _, x, y in sorted(ranked):
+    for *_, x, y in sorted(ranked):
         spot = np.array([x, y])
         if all(np.linalg.norm(spot - other) >= 1.9 * place.spot_step for other in chosen):
             chosen.append(spot)
-        if len(chosen) == place.spots:
+        if len(chosen) == place.spots and not every:
             break
     return tuple(chosen)
+
+
+def _room(spot: tuple[float, float], others: Sequence[Detection]) -> float:
+    """Distance from a spot to the nearest box of other objects, seen from above, m."""
+    return min((float(distances_from(d, np.array([spot]))[0]) for d in others), default=inf)
 
 
 def clear_spots(

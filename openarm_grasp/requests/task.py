@@ -58,6 +58,11 @@ class Grasp:
     heavy: Array | None = None
     adjacent: tuple[Detection, ...] = ()
 
+    @property
+    def in_part(self) -> bool:
+        """Whether there may be more of it than was seen."""
+        return bool(self.adjacent) or not self.sighting.target.measured
+
     def motion_to(self, target: PlaceTarget) -> Array:
         """(4, 4) how the hand moves the object from where it takes hold of it to a place, base frame."""
         return target.T_base_tcp @ se3.inverse(self.candidate.T_base_tcp)
@@ -141,8 +146,14 @@ class GraspSession:
                 )
 
     def partly_open(self, robot: Skills, arm: str) -> bool:
-        """Whether the fingers are neither closed on nothing nor wide open, so that something may be between them."""
-        return self.context.config.held.closed_below < robot.aperture(arm) and not robot.is_open(arm)
+        """Whether something may be between the fingers: they are neither closed on nothing nor wide open.
+
+        As wide as they had closed on what they kept, they hold it, though that be nearly as wide as they open.
+        """
+        aperture, held, kept = robot.aperture(arm), self.context.config.held, self.kept.get(arm)
+        if kept is not None and kept.closed is not None and abs(aperture - kept.closed) <= held.slip:
+            return True
+        return held.closed_below < aperture and not robot.is_open(arm)
 
     async def release(self, robot: Skills, arm: str) -> str:
         """Open a hand where it is, and forget what it held; return what was done, in a sentence.

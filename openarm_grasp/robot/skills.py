@@ -176,6 +176,7 @@ class Skills:
         after: Trajectory | None = None,
         *,
         turned: bool = False,
+        in_part: bool = False,
     ) -> Planned:
         """Plan how to put the object down; the map may still show it where it was, or below the hand that lifted it.
 
@@ -186,6 +187,7 @@ class Skills:
             candidate: How the hand holds it.
             after: Trajectory whose end is the start; None starts at the present joints.
             turned: It has turned in the hand: the map shows it around the hand, and how it hangs is not known.
+            in_part: There may be more of it than was seen: the map shows that around the hand.
         """
         held = held_boxes(found.target, candidate, self._config)
         obstacles = neighbours(found, target_boxes(found.target, candidate, self._config), self._config)
@@ -195,6 +197,7 @@ class Skills:
         ignored = [column]
         if turned:
             held = ()
+        if turned or (in_part and after is None):
             reach = 2.0 * float(np.linalg.norm(found.target.size))
             ignored.append(Box(f"{stood.id}/hanging", se3.make(p=self.T_base_tcp(arm)[:3, 3]), np.full(3, reach)))
         return await self.plan(PlanPlace(arm, tuple(ways), obstacles, held, after, tuple(ignored)))

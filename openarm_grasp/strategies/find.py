@@ -65,9 +65,8 @@ async def find_grasp(run: Run, why: str) -> tuple[Grasp, Planned | None, str]:
     while True:
         sighting = await detect(run, why)
         if run.kept is not None:
-            grasp = grasp_of(run, run.kept.arm, sighting, run.kept.candidate)
-            grasp = replace(grasp, closed=run.kept.closed, turned=run.kept.turned, adjacent=run.kept.adjacent)
-            run.grasp = grasp
+            places = grasp_of(run, run.kept.arm, sighting, run.kept.candidate).places
+            grasp = run.grasp = replace(run.kept, sighting=sighting, places=places)
             why = f"the {grasp.arm} hand holds {run.label!r}; {len(grasp.places)} ways to place it"
             if run.request.dry_run:
                 _, target = await plan_place(run, grasp, grasp.places, why)
@@ -276,7 +275,10 @@ async def _plan_with(
         # Also without a place that is asked for: no free spot is a reason not to lift.
         grasp = run.grasp = grasp_of(run, arm, sighting, candidate)
         chosen = f"grasp {candidate.id} with the {arm} arm"
-        if request.place is None and not (request.dry_run or (request.confirm and request.phase == "all")):
+        # a hand that leans may find no way to a spot among other things
+        among = grasp.of_cloud and bool(sighting.others) and request.phase == "all"
+        shown = request.dry_run or (request.confirm and request.phase == "all")
+        if request.place is None and not (among or shown):
             return grasp, found, chosen
         run.enter(State.PLAN, f"{chosen}; planning the place")
         try:
@@ -306,7 +308,9 @@ def grasp_of(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) 
     if request.place is not None:
         spots = (check_position(request.place, target, others, table),)
     else:
-        spots = free_spots(arm, target, others, run.config, run.context.shoulders, request.place_choices)
+        # what a hand has kept because it could not be put down has to go somewhere
+        every, shoulders = run.kept is not None, run.context.shoulders
+        spots = free_spots(arm, target, others, run.config, shoulders, request.place_choices, every=every)
     places = place_targets(target, candidate, spots, run.config, run.used_places, yaw=request.place_yaw)
     adjacent = tuple(d for d in others if d.measured and gap(d, target) < NEXT_TO)
     return Grasp(arm, sighting, candidate, places, adjacent=adjacent)
@@ -334,7 +338,9 @@ async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why:
             return ready, ways[ready.chosen]
         run.enter(State.PLACE, f"the confirmed place has to be planned again: {why}")
     while True:
-        plan = await run.robot.plan_place(grasp.arm, ways, grasp.sighting, grasp.candidate, turned=grasp.turned)
+        plan = await run.robot.plan_place(
+            grasp.arm, ways, grasp.sighting, grasp.candidate, turned=grasp.turned, in_part=grasp.in_part
+        )
         target = ways[plan.chosen]
         why = await agreed(run, State.PLACE, grasp, f"place {target} with the {grasp.arm} arm", place=plan)
         if not why:

@@ -307,7 +307,8 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
             where = judge_held(columns(before, run.context.table.top_z), points, moved, config.held)
             if not where.ok:
                 heavy = heavier_end(object_points(thing.clouds), points, T)
-                run.grasp, camera = replace(grasp, turned=True, heavy=heavy), where
+                run.grasp = grasp = replace(grasp, turned=True, heavy=heavy)
+                camera = where
     else:
         camera = verdicts.judge_sight(
             sighting.target,

@@ -13,6 +13,7 @@ from openarm_common import se3
 from openarm_common.errors import Code
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.scene.scene import Scene, load_scene, parse_scene
+from openarm_evaluation.campaign.in_process_robot import InProcessRobot
 from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
@@ -21,6 +22,7 @@ from openarm_grasp.evidence.verdicts import CameraVerdict
 from openarm_grasp.perception.detections import Frame, Sighting
 from openarm_grasp.perception.sightings import in_box
 from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from openarm_grasp.sampling.views import views_of
 from openarm_grasp.strategies import find, verify
 from openarm_grasp.strategies.registry import carry_out
@@ -101,6 +103,41 @@ def kept_banana() -> tuple[Trials, str]:
     assert trials.link.run(carry_out(trials.grasp_task(GraspRequest("anything", phase="pick")))).success
     (arm,) = trials.session.kept
     return trials, arm
+
+
+@pytest.mark.parametrize("in_part", [False, True])
+def test_the_map_around_the_hand_is_in_no_way_where_more_than_was_seen_hangs_in_it(monkeypatch, in_part) -> None:
+    trials, arm = kept_banana()
+    kept = trials.session.kept[arm]
+    trials.session.kept[arm] = replace(kept, adjacent=(kept.sighting.target,) if in_part else ())
+    plan, asked = InProcessRobot.plan, list[PlanPlace]()
+
+    async def watched(self: InProcessRobot, request: PlanGrasp | PlanPlace) -> Planned:
+        asked.extend([request] if isinstance(request, PlanPlace) else [])
+        return await plan(self, request)
+
+    monkeypatch.setattr(InProcessRobot, "plan", watched)
+    p_base_tcp = trials.skills.T_base_tcp(arm)[:3, 3]
+    trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    regions = [box for box in asked[0].ignore_regions if box.id.endswith("/hanging")]
+    assert len(regions) == in_part
+    assert all(box.T_frame_box[:3, 3] == pytest.approx(p_base_tcp, abs=0.01) for box in regions)
+    assert asked[0].held
+
+
+def test_among_other_things_the_place_is_planned_before_the_lift() -> None:
+    senses = SimulatedSenses(depth_noise=True, detector="anything")
+    items = [
+        {"name": name, "shape": "mesh", "object": name, "position": [0.27, y], "yaw": 0.4}
+        for name, y in (("banana", -0.20), ("apple", -0.38))
+    ]
+    table = load_scene("empty").table.model_dump()
+    scene = parse_scene({"name": "two", "table": table, "objects": items}, "two")
+    trials = Trials(Task("nominal", 1, scene, ("anything",)), senses, GraspConfig())
+    trials.robot.pass_time(0.5)
+    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest(""))))
+    assert outcome.success, outcome.message
+    assert any("planning the place" in step.reason for step in trials.steps)
 
 
 def test_one_image_that_shows_it_at_its_place_is_enough(monkeypatch) -> None:

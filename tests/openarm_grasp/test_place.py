@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common import se3
-from openarm_common.detection import Detection
+from openarm_common.detection import Detection, distances_from
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
@@ -156,6 +156,23 @@ def test_a_spot_that_leaves_room_for_a_hand_comes_before_a_nearer_one() -> None:
     assert near == sorted(near)
     assert not near[0]
     assert rooms(GraspConfig.model_validate({"place": {"neighbour_room": 0.0}}))[0] < CONFIG.place.neighbour_room
+
+
+@pytest.mark.requirement("P-19")
+def test_a_spot_that_something_long_reaches_into_is_not_chosen_where_there_are_others() -> None:
+    """Its middle may be far from there."""
+    target = box(x=0.2, y=-0.08, size=(0.10, 0.06, 0.05))
+    long = box(x=0.27, y=-0.30, yaw=0.0, size=(0.04, 0.30, 0.05), label="blue")
+    spots = np.array(free_spots("right", target, [long], CONFIG, SHOULDERS))
+    assert len(spots) == CONFIG.place.spots
+    assert distances_from(long, spots).min() >= 0.5 * np.hypot(0.10, 0.06)
+
+
+def test_every_free_spot_is_offered_for_what_a_hand_has_kept() -> None:
+    some = free_spots("right", box(y=-0.3), [], CONFIG, SHOULDERS)
+    every = free_spots("right", box(y=-0.3), [], CONFIG, SHOULDERS, every=True)
+    assert len(every) > len(some) == CONFIG.place.spots
+    assert [*map(tuple, every[: len(some)])] == [*map(tuple, some)]
 
 
 def test_a_full_table_has_no_free_spot():

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -66,6 +67,20 @@ def test_a_hand_that_holds_nothing_any_more_is_forgotten(world) -> None:
         world.session.check_hands(world, GraspRequest("blue"))
     world.session.check_hands(world, GraspRequest("blue", dry_run=True))
     world.gap = 0.0
+    world.session.check_hands(world, GraspRequest("blue"))
+    assert not world.session.kept
+
+
+@pytest.mark.requirement("P-01")
+def test_what_is_nearly_as_wide_as_the_hand_opens_is_still_held(world) -> None:
+    assert world.grasp("red", phase="pick").success
+    opening = 2.0 * world.robot.description.hand("right").parts.opening
+    world.session.kept["right"] = replace(world.session.kept["right"], closed=opening - 0.0035)
+    world.gap = opening - 0.003  # within the tolerance of an open hand
+    assert world.is_open("right")
+    with pytest.raises(OpenArmError, match="right hand still holds 'red'"):
+        world.session.check_hands(world, GraspRequest("blue"))
+    world.gap = opening
     world.session.check_hands(world, GraspRequest("blue"))
     assert not world.session.kept
 
