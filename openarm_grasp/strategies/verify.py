@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,7 +25,9 @@ from openarm_grasp.planning.place import placing_error
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import Grasp, Placed
 from openarm_grasp.robot.skills import reraise_stop
-from openarm_grasp.strategies.run import Run
+
+if TYPE_CHECKING:
+    from openarm_grasp.strategies.run import Run
 
 #: Share of the tolerance of a place in which the middle of any shape must be seen: it may be millimetres elsewhere.
 _SEEN_WITHIN = 0.75
