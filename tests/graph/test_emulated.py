@@ -20,8 +20,8 @@ from tests.graph.asking import Asked
 pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 
 
-#: Images a second next to motors in real time that detection needs; a camera makes 30.
-ENOUGH_HZ = 12.0
+#: Images a second in which objects are detected next to motors in real time that a grasp needs; a camera makes 30.
+ENOUGH_HZ = 4.0
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,11 @@ def up(start_graph: Any) -> Any:
     settings = ("grasp.detect.max_age=3.0", "openarm_hardware.motors.silent=250")
     graph = start_graph("real", "--emulate", *(word for setting in settings for word in ("--set", setting)))
     graph.wait_ready()
-    measured = graph.openarm("topic", "hz", "/overhead/color/camera_info", "--domain", str(graph.domain), "--json")
+    measured = graph.openarm("topic", "hz", "/detections_3d", "--domain", str(graph.domain), "--json")
+    assert measured.returncode == 0, measured.stdout + measured.stderr
     rate = json.loads(measured.stdout)["rate_hz"]
     if rate < ENOUGH_HZ:
-        pytest.skip(f"next to motors in real time this machine draws {rate:.0f} images a second of 30")
+        pytest.skip(f"next to motors in real time this machine detects in {rate:.0f} images a second of 30")
     return graph
 
 
