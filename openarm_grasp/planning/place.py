@@ -26,7 +26,7 @@ from openarm_grasp.planning.arms import Shoulders, sides
 from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, hold_of
 
 #: Spots nearer to each other than this are one, m.
-_SAME_SPOT = 0.02
+SAME_SPOT = 0.02
 
 
 def place_targets(
@@ -119,7 +119,7 @@ def symmetry(target: Detection) -> float:
 
 def _failed(used: Sequence[PlaceTarget], spot: Array, yaw: float, *, any_turn: bool) -> bool:
     return any(
-        np.linalg.norm(t.position[:2] - spot[:2]) < _SAME_SPOT and (any_turn or abs(t.yaw_offset - yaw) < 1e-6)
+        np.linalg.norm(t.position[:2] - spot[:2]) < SAME_SPOT and (any_turn or abs(t.yaw_offset - yaw) < 1e-6)
         for t in used
     )
 
@@ -172,17 +172,20 @@ def free_spots(
     ys = np.concatenate([grid(*place.region_abs_y, place.spot_step) * side for side in sides(arm, shoulders)])
     spots = choices or [*product(grid(*place.region_x, place.spot_step), ys)]
     reach = 0.5 * float(np.hypot(*target.size[:2]))
-    ranked = [
-        (_room((x, y), others) < reach, clearance < place.neighbour_room, cost, x, y)
-        for cost, clearance, x, y in clear_spots(spots, target, others, place)
-    ]
-    if not ranked:
+    clear = clear_spots(spots, target, others, place)
+    if not clear:
         what = f"none of {len(choices)} places is free" if choices else f"no free spot for the {arm} arm"
         raise OpenArmError(
             Code.PLACE_FAILED,
             f"{what}: none is {place.neighbour_distance * 1e3:.0f} mm from"
             f" {len(others)} other objects and {place.origin_distance * 1e3:.0f} mm from where it stood",
         )
+    xy = np.array([spot[2:] for spot in clear])
+    room = np.min([np.full(len(xy), inf), *(distances_from(d, xy) for d in others)], axis=0)
+    ranked = [
+        (bool(free < reach), clearance < place.neighbour_room, cost, x, y)
+        for free, (cost, clearance, x, y) in zip(room, clear, strict=True)
+    ]
     # Six spots side by side would share one fate, so those offered lie apart.
     chosen: list[Array] = []
     for *_, x, y in sorted(ranked):
@@ -192,11 +195,6 @@ def free_spots(
         if len(chosen) == place.spots and not every:
             break
     return tuple(chosen)
-
-
-def _room(spot: tuple[float, float], others: Sequence[Detection]) -> float:
-    """Distance from a spot to the nearest box of other objects, seen from above, m."""
-    return min((float(distances_from(d, np.array([spot]))[0]) for d in others), default=inf)
 
 
 def clear_spots(

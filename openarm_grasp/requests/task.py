@@ -21,6 +21,7 @@ from openarm_grasp.evidence.verdicts import Evidence, GripperVerdict, Verdict, j
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.place import SAME_SPOT
 from openarm_grasp.requests.confirm import PlanGate, ShownPlan
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.requests.state_times import StateClock
@@ -29,8 +30,8 @@ from openarm_grasp.requests.states import State
 if TYPE_CHECKING:
     from openarm_grasp.robot.skills import Skills
 
-#: Objects whose places are remembered; edge of a cell of their points; what is nearer to a place is there, m.
-_REMEMBERED, _CELL, _SAME_SPOT = 50, 0.01, 0.02
+#: Objects whose places are remembered, and the edge of a cell of their points, m.
+_REMEMBERED, _CELL = 50, 0.01
 
 
 # --- what outlives a request
@@ -112,19 +113,20 @@ class GraspSession:
         self._placed: list[tuple[Array, Array]] = []
 
     def note_placed(self, position: Array, points: Array) -> None:
-        """Remember where an object was placed.
+        """Remember where an object was placed, in place of what was placed there before.
 
         Args:
             position: (2,) or (3,) base frame, m.
             points: (n, 3) of it, as far as known.
         """
         cells = np.unique(np.round(points[:, :2] / _CELL), axis=0) * _CELL
-        self._placed = [*self._placed[1 - _REMEMBERED :], (position[:2], cells)]
+        kept = [one for one in self._placed if np.linalg.norm(one[0] - position[:2]) >= SAME_SPOT]
+        self._placed = [*kept[1 - _REMEMBERED :], (position[:2], cells)]
 
     def parts_of(self, stay: Sequence[Sequence[float]]) -> tuple[Array, ...]:
         """Return where points (n, 2) of objects are that were placed at some of the positions (x, y), m."""
         placed = (one for one in self._placed if len(one[1]))
-        return tuple(cells for p, cells in placed if any(np.linalg.norm(p - q[:2]) < _SAME_SPOT for q in stay))
+        return tuple(cells for p, cells in placed if any(np.linalg.norm(p - q[:2]) < SAME_SPOT for q in stay))
 
     def check_hands(self, robot: Skills, request: GraspRequest) -> None:
         """Refuse what would drop an object that an ended request left in a hand; forget one that is gone.
@@ -148,7 +150,8 @@ class GraspSession:
     def partly_open(self, robot: Skills, arm: str) -> bool:
         """Whether something may be between the fingers: they are neither closed on nothing nor wide open.
 
-        As wide as they had closed on what they kept, they hold it, though that be nearly as wide as they open.
+        A hand that is as wide as when it closed on the object that it kept still holds it, even within the tolerance of
+        a wide open one.
         """
         aperture, held, kept = robot.aperture(arm), self.context.config.held, self.kept.get(arm)
         if kept is not None and kept.closed is not None and abs(aperture - kept.closed) <= held.slip:

@@ -72,9 +72,9 @@ def _judge_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]
         return _unproven("it had turned or slipped in the hand: nothing shows that it is where it should be")
     before = cluster_of(grasp.sighting)
     T_base_now = grasp.motion_to(placed.target)
+    judge = _seen_in_part if before.cut else _seen_whole
     newest = CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
     for age, frame in enumerate(reversed(frames)):
-        judge = _seen_in_part if before.cut else _seen_whole
         verdict = judge(frame, run, grasp, placed.target, before, T_base_now)
         if verdict.ok:
             return _gone_with_it(grasp, frames) or verdict

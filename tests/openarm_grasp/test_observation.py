@@ -185,11 +185,11 @@ def test_a_part_of_what_must_stay_is_not_picked() -> None:
 
 def test_a_piece_of_what_must_stay_is_not_picked_however_far_from_its_middle() -> None:
     end = seen(x=0.30, y=-0.08, size=(0.02, 0.05, 0.01))
-    beside = seen(x=0.34, y=-0.08, size=(0.02, 0.05, 0.01), score=0.8)
+    neighbour = seen(x=0.34, y=-0.08, size=(0.02, 0.05, 0.01), score=0.8)
     whole = np.column_stack([np.full(20, 0.30), np.linspace(-0.25, -0.06, 20)])
     stay = ((0.30, -0.155),)
-    assert look(frames((end, beside)), exclude_near=stay).target.p_base[0] == pytest.approx(0.30)
-    found = look(frames((end, beside)), exclude_near=stay, exclude_parts=(whole,))
+    assert look(frames((end, neighbour)), exclude_near=stay).target.p_base[0] == pytest.approx(0.30)
+    found = look(frames((end, neighbour)), exclude_near=stay, exclude_parts=(whole,))
     assert found.target.p_base[0] == pytest.approx(0.34)
 
 
