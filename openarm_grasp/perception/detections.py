@@ -28,7 +28,8 @@ from openarm_grasp.config import DetectConfig
 SAME_PLACE = 0.05
 #: Things nearer to each other than this may be parts of one, m.
 NEXT_TO = 0.03
-#: Where the middle of an object is that is not asked for, what has that in its box is a part of it, or nearly, m.
+#: Where the middle of an object is that is not asked for, what has its middle there, or has that in its box, or nearly,
+#: is it or a part of it, m.
 _PART = 0.01
 #: What has its middle this near to a point of something is a piece of that, m.
 _ON = 0.015
@@ -339,8 +340,9 @@ def _anchor(
 def _excluded(fitting: Sequence[Detection], exclude_near: Sequence[Sequence[float]]) -> NDArray[np.bool_]:
     """Which detections stay where they are (bool).
 
-    Of each position: what is nearest to it and within `SAME_PLACE`; all that is nearer than half of that, and all that
-    has it in its box, as these may be parts of one object. What else stands close by is another object.
+    Of each position: what is nearest to it and within `SAME_PLACE`; all that is nearer than half of that, and, unless
+    something has its middle there, all that has it in its box, as these may be parts of one object. What else stands
+    close by is another object.
     """
     stay = np.zeros(len(fitting), dtype=np.bool_)
     if not fitting or not exclude_near:
@@ -349,7 +351,7 @@ def _excluded(fitting: Sequence[Detection], exclude_near: Sequence[Sequence[floa
     away = np.array([[distance_to(d, p) for p in exclude_near] for d in fitting])
     nearest = away.argmin(axis=0)
     stay[nearest[away.min(axis=0) <= SAME_PLACE]] = True
-    in_box = np.array([distances_from(d, positions) <= _PART for d in fitting])
+    in_box = np.array([distances_from(d, positions) <= _PART for d in fitting]) & (away.min(axis=0) > _PART)
     return stay | ((away <= SAME_PLACE / 2.0) | in_box).any(axis=1)
 
 

@@ -183,6 +183,15 @@ def test_a_part_of_what_must_stay_is_not_picked() -> None:
     assert look(frames((handle, other)), exclude_near=((0.33, -0.185),)).target.p_base[1] == pytest.approx(-0.1)
 
 
+def test_what_lies_around_something_that_must_stay_is_picked() -> None:
+    around = seen(x=0.25, yaw=0.6, size=(0.19, 0.10, 0.008))  # open scissors with a tube between their blades
+    inside = seen(x=0.30, y=-0.18, score=0.8, size=(0.05, 0.05, 0.05))
+    assert look(frames((around, inside)), exclude_near=((0.30, -0.18),)).target.p_base[0] == pytest.approx(0.25)
+    assert look(frames((around,)), exclude_near=((0.40, -0.18),)).target.p_base[0] == pytest.approx(0.25)
+    with pytest.raises(OpenArmError, match="besides 1 that must stay"):
+        look(frames((around,)), exclude_near=((0.30, -0.18),))
+
+
 def test_a_piece_of_what_must_stay_is_not_picked_however_far_from_its_middle() -> None:
     end = seen(x=0.30, y=-0.08, size=(0.02, 0.05, 0.01))
     neighbour = seen(x=0.34, y=-0.08, size=(0.02, 0.05, 0.01), score=0.8)
