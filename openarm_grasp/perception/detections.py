@@ -188,7 +188,7 @@ def find(
         limits: How near detections must be to be one object, and how much it may seem to move.
         at: (x, y) where it stands, m; None: anywhere.
         exclude_near: (x, y) of objects that are excluded, m.
-        exclude_parts: (n, 2) where points of them are, m.
+        exclude_parts: (n, 2) where points of others are that are excluded, m.
         same: The object as it was seen or left before: it is looked for alone, whatever the words fit now.
 
     Raises:
@@ -320,8 +320,7 @@ def _anchor(
     """The detection of the object that is asked for."""
     name = label or "the object"
     stay = _excluded(fitting, exclude_near)
-    # a thin thing may be seen in pieces
-    stay |= [any(np.linalg.norm(part - d.p_base[:2], axis=1).min() <= _ON for part in exclude_parts) for d in fitting]
+    stay |= [any(_of_it(d, points) for points in exclude_parts) for d in fitting]
     chosen = [d for d, stays in zip(fitting, stay, strict=True) if not stays]
     if not chosen:
         raise OpenArmError(
@@ -353,6 +352,13 @@ def _excluded(fitting: Sequence[Detection], exclude_near: Sequence[Sequence[floa
     stay[nearest[away.min(axis=0) <= SAME_PLACE]] = True
     in_box = np.array([distances_from(d, positions) <= _PART for d in fitting]) & (away.min(axis=0) > _PART)
     return stay | ((away <= SAME_PLACE / 2.0) | in_box).any(axis=1)
+
+
+def _of_it(d: Detection, points: Array) -> bool:
+    """Whether a detection is a thing of which points (n, 2) are known, has it in its box, or is a piece of it."""
+    return bool(
+        np.linalg.norm(points - d.p_base[:2], axis=1).min() <= _ON or np.median(distances_from(d, points)) <= _PART
+    )
 
 
 def _same_thing(a: Detection, b: Detection) -> bool:

@@ -22,10 +22,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.wanted import EASIEST, takes_all
 from openarm_grasp.perception.detections import SAME_PLACE
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.requests.request import GraspRequest, Spot
 
-#: (x, y), base frame, m.
-Spot = tuple[float, float]
 #: With these there is nothing more to ask for, whatever it is.
 _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 #: There is no more of it in view.

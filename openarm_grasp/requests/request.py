@@ -21,6 +21,8 @@ from openarm_grasp.requests.state_times import StateTime
 if TYPE_CHECKING:
     from openarm_grasp.planning.options import Option
 
+#: (x, y), base frame, m.
+Spot = tuple[float, float]
 #: What a request may ask for.
 PHASES = ("all", "pick", "place", "aside")
 
@@ -41,7 +43,7 @@ class GraspRequest:
         timeout: s of robot time for all of it; 0: none.
         object_at: (x, y) near which the object is, base frame, m; None: any that is called so.
         exclude_near: (x, y) of objects that stay where they are, base frame, m.
-        exclude_parts: (n, 2) where points of such objects are, as far as known, base frame, m.
+        exclude_parts: (n, 2) where points of others are that do, base frame, m.
         place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
         why: What it is for, when it is a part of another request.
         same: The object, when an earlier part of the request was about it: as it was seen or left then.
@@ -56,9 +58,9 @@ class GraspRequest:
     place_yaw: float | None = None
     timeout: float = 0.0
     object_at: tuple[float, ...] | None = None
-    exclude_near: tuple[tuple[float, float], ...] = ()
+    exclude_near: tuple[Spot, ...] = ()
     exclude_parts: tuple[Array, ...] = ()
-    place_choices: tuple[tuple[float, float], ...] = ()
+    place_choices: tuple[Spot, ...] = ()
     why: str = ""
     same: Sighting | None = None
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -23,7 +24,7 @@ from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import SAME_SPOT
 from openarm_grasp.requests.confirm import PlanGate, ShownPlan
-from openarm_grasp.requests.request import GraspOutcome, GraspRequest
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest, Spot
 from openarm_grasp.requests.state_times import StateClock
 from openarm_grasp.requests.states import State
 
@@ -123,10 +124,11 @@ class GraspSession:
         kept = [one for one in self._placed if np.linalg.norm(one[0] - position[:2]) >= SAME_SPOT]
         self._placed = [*kept[1 - _REMEMBERED :], (position[:2], cells)]
 
-    def parts_of(self, stay: Sequence[Sequence[float]]) -> tuple[Array, ...]:
-        """Return where points (n, 2) of objects are that were placed at some of the positions (x, y), m."""
-        placed = (one for one in self._placed if len(one[1]))
-        return tuple(cells for p, cells in placed if any(np.linalg.norm(p - q[:2]) < SAME_SPOT for q in stay))
+    def parts_of(self, stay: Sequence[Spot]) -> tuple[tuple[Spot, ...], tuple[Array, ...]]:
+        """Return positions at which nothing known was placed, and where points (n, 2) are of what was at others, m."""
+        placed = {q: [cells for p, cells in self._placed if len(cells) and math.dist(p, q) < SAME_SPOT] for q in stay}
+        known = {q: cells[-1] for q, cells in placed.items() if cells}
+        return tuple(q for q in stay if q not in known), tuple(known.values())
 
     def check_hands(self, robot: Skills, request: GraspRequest) -> None:
         """Refuse what would drop an object that an ended request left in a hand; forget one that is gone.

@@ -27,6 +27,7 @@ from openarm_grasp.perception.detections import Frame, apart
 from openarm_grasp.perception.sightings import object_points, points_around
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.neighbours import columns
+from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import place_targets
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.requests.states import Hand, State
@@ -347,7 +348,11 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
             if error.code is Code.GRASP_LOST:
                 raise
             if run.kept is not None or failure is not None:
-                raise ObjectKeptError(Code.PLACE_FAILED, still_held(run, error)) from error
+                if grasp.turned or error.code not in NO_WAY:
+                    raise ObjectKeptError(Code.PLACE_FAILED, still_held(run, error)) from error
+                # with its hand in the way, or other things: it may hang otherwise than is known
+                grasp, why = replace(grasp, turned=True), f"{error.message}; as what has turned in the hand"
+                continue
             text = f"{run.label!r} could not be placed ({error.code}): {error.message}"
             # What kept it from its place may not do so at the next attempt.
             passing = error.code in (Code.EXECUTION_FAILED, Code.TIMEOUT)

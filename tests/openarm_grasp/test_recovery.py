@@ -219,6 +219,16 @@ def test_a_hand_that_can_put_its_object_nowhere_keeps_it_and_says_so(world):
     assert list(world.session.kept) == ["right"]
 
 
+def test_what_hangs_around_the_hand_is_let_go_though_no_plan_knows_how_it_hangs(world):
+    """As far as known the hand could not leave it: another thing may have come along."""
+    world.fail(lambda e: isinstance(e, PlanPlace) and e.held, Code.IN_COLLISION)
+    outcome = world.grasp()
+    assert outcome.code is Code.PLACE_FAILED
+    assert world.held is None
+    assert not world.session.kept
+    assert any("as what has turned in the hand" in status.reason for status in world.status)
+
+
 def test_a_failed_way_back_after_release_still_ends_well(world):
     world.fail(world.follows_path("leave"), Code.EXECUTION_FAILED, times=1)
     outcome = world.grasp()
