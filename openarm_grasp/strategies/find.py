@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +30,7 @@ from openarm_grasp.planning import retries
 from openarm_grasp.planning.arms import out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, little_turns, shorter
 from openarm_grasp.planning.neighbours import crowded, standing_boxes
-from openarm_grasp.planning.options import NoWayError, not_placeable, options_of, planned
+from openarm_grasp.planning.options import NO_WAY, NoWayError, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets
 from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
 from openarm_grasp.requests.states import State
@@ -126,14 +127,22 @@ def _missing(run: Run, seen: Frames) -> OpenArmError | None:
 
 
 async def _clear_view(run: Run) -> None:
-    """Send the arms home that may hide something. A dry run moves nothing, nor does what is not confirmed yet."""
+    """Send the arms home that may hide something; one that finds no way home stays where it is.
+
+    A dry run moves nothing, nor does what is not confirmed yet.
+    """
     if run.request.dry_run or run.request.confirm or run.missed > 0 or run.plans_failed > 0:
         return
-    if run.kept is not None:
-        # A hand that holds something stays where it is; it may be among the objects.
-        await run.robot.go_home([arm for arm in run.robot.description.arm_names if arm not in run.task.session.kept])
-    else:
-        await run.robot.go_home(run.robot.description.arm_names, back_off_below=run.context.clear_of_objects)
+    kept, robot = run.task.session.kept if run.kept is not None else {}, run.robot
+    # A hand that holds something stays where it is; it may be among the objects.
+    below = run.context.clear_of_objects if run.kept is None else -inf
+    for arm in (arm for arm in robot.description.arm_names if arm not in kept):
+        try:
+            await robot.go_home((arm,), back_off_below=below)
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            robot.warn(f"{error.message}; it stays where it is")
 
 
 def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:

@@ -31,8 +31,10 @@ def still_held(run: Run, error: OpenArmError) -> str:
 async def retreat(run: Run, grasp: Grasp, placed: Placed | None) -> None:
     """Leave the object, putting it down first when it is held, and go home with an open hand.
 
+    An empty hand that finds no way home, also without regard to obstacles, stays where it is.
+
     Raises:
-        OpenArmError: When there is no way home, also without regard to obstacles; the arm stays where it is.
+        OpenArmError: When the hand holds the object and finds none, or the arm does not do what was planned.
     """
     run.robot.stop_observing()
     failure = run.failure if placed is None else placed.failure
@@ -43,6 +45,9 @@ async def retreat(run: Run, grasp: Grasp, placed: Placed | None) -> None:
             return
         except OpenArmError as error:
             reraise_stop(error)
+            if last and error.code in NO_WAY and not run.holding:
+                run.robot.warn(f"{error.message}; it stays where it is")
+                return
             if last or run.holding:
                 text = f"the arm could not go home: {still_held(run, error) if run.holding else error.message}"
                 code, text = (failure.code, f"{failure.reason}; {text}") if failure else (error.code, text)

@@ -242,12 +242,22 @@ def test_the_placed_object_is_kept_clear_of_on_the_way_home(world):
     assert [b.id for b in home.obstacles] == ["detected/blue_0", "placed/red"]
 
 
-def test_no_way_home_is_tried_without_obstacles_then_named(world):
-    world.fail(lambda e: isinstance(e, GoHome) and e.arms == ("right",), Code.IN_COLLISION)
+@pytest.mark.parametrize("code", [Code.IN_COLLISION, Code.EXECUTION_FAILED])
+def test_no_way_home_is_tried_without_obstacles_then_the_arm_stays_or_says_what_keeps_it(world, code):
+    homes = iter([False, True, True])
+    world.fail(lambda e: isinstance(e, GoHome) and e.arms == ("right",) and next(homes), code)
     outcome = world.grasp()
-    assert outcome.code is Code.IN_COLLISION
-    assert "could not go home" in outcome.message
-    assert [len(e.obstacles) for e in world.done(GoHome) if e.arms == ("right",)] == [2, 0]
+    assert outcome.code is (Code.OK if code is Code.IN_COLLISION else code), outcome.message
+    assert outcome.success or "could not go home" in outcome.message
+    assert [len(e.obstacles) for e in world.done(GoHome) if e.arms == ("right",)] == [0, 2, 0]
+
+
+@pytest.mark.parametrize(("code", "goes_on"), [(Code.IN_COLLISION, True), (Code.ROBOT_LOST, False)])
+def test_an_arm_that_finds_no_way_home_keeps_the_other_from_nothing(world, code, goes_on):
+    world.fail(lambda e: isinstance(e, GoHome) and e.arms == ("left",), code)
+    outcome = world.grasp()
+    assert outcome.success is goes_on, outcome.message
+    assert goes_on or outcome.code is code
 
 
 # --- stopping
