@@ -70,6 +70,9 @@ class HandConfig(Config):
     open_tolerance: float = Field(
         default=0.004, gt=0.0, le=0.01, description="a finger this near to where it is open is there, m"
     )
+    lets_go: float = Field(
+        default=0.010, gt=0.0, le=0.05, description="a gap wider than what was held by this holds nothing, m"
+    )
 
 
 class TimingConfig(Config):

@@ -236,6 +236,13 @@ def judge_moved(before: Array, T_after_before: Array, now: Array, config: HeldCo
     return CameraVerdict(Code.OK, f"what was seen of it is within {off:.0f} mm of where it was put down")
 
 
+def is_more(now: Array, before: Array, T_after_before: Array, config: HeldConfig) -> bool:
+    """Whether more of a thing is seen than before, from above; arguments as `judge_moved`."""
+    there = _upper(before @ T_after_before[:3, :3].T + T_after_before[:3, 3])
+    away, _ = KDTree(there[:, :2]).query(_upper(now)[:, :2])
+    return bool(np.percentile(away, _MOST) > config.moved)
+
+
 def _upper(points: Array) -> Array:
     """Return the highest of the points (n, 3) in each cell, seen from above."""
     order = points[np.argsort(-points[:, 2], kind="stable")]

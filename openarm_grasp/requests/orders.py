@@ -30,8 +30,8 @@ _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 #: What is refused so may be taken where others are pushed away from it.
 _BY_PLACE = (*(code for code in NO_WAY if code is not Code.TOO_WIDE), *_GONE)
-#: What is refused so may lie on others, or keep a hand from them; the likelier first.
-_IN_THE_WAY = (Code.TOO_WIDE, Code.IN_COLLISION)
+#: What is refused so may lie on others, keep a hand from them, or lie badly itself; the likelier first.
+_IN_THE_WAY = (Code.TOO_WIDE, Code.IN_COLLISION, Code.NO_PLAN, Code.UNREACHABLE)
 #: With these the camera had not shown enough yet: another look may.
 _NOT_SEEN = (Code.STALE_DATA, Code.TIMEOUT)
 #: Requests in vain, one after the other, until a label is given up: that saw nothing, and that moved an arm.

@@ -61,6 +61,11 @@ class Grasp:
     adjacent: tuple[Detection, ...] = ()
 
     @property
+    def width(self) -> float:
+        """Gap at which the hand holds it, m."""
+        return self.candidate.width if self.closed is None else self.closed
+
+    @property
     def in_part(self) -> bool:
         """Whether there may be more of it than was seen."""
         return bool(self.adjacent) or not self.sighting.target.measured
@@ -182,7 +187,7 @@ class GraspSession:
                 else "no hand holds anything",
             )
         arm = arm or holding[0]
-        await robot.open(arm, "release")
+        await robot.open(arm, "release", held=robot.aperture(arm))
         kept = self.kept.pop(arm, None)
         return f"the {arm} hand is open" + (f"; it held {kept.sighting.target.label!r}" if kept else "")
 

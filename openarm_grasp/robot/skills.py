@@ -8,6 +8,7 @@ does not succeed.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Literal
 
 import numpy as np
@@ -377,13 +378,14 @@ class Skills:
         reader = self._hands[arm]
         return reader.finger() >= reader.hand.parts.opening - self._config.hand.open_tolerance
 
-    async def open(self, arm: str, what: str, aperture: float | None = None) -> None:
+    async def open(self, arm: str, what: str, aperture: float | None = None, *, held: float = inf) -> None:
         """Open the hand.
 
         Args:
             arm: Whose hand.
             what: For errors, for example "release".
             aperture: Distance between the fingers, m; None: wide open.
+            held: Gap at which it holds something, m: `lets_go` more is enough, as other things may stop the fingers.
 
         Raises:
             OpenArmError: EXECUTION_FAILED, when the fingers do not get there.
@@ -401,8 +403,10 @@ class Skills:
 
         await robot.until(lambda: there() or robot.now_ns > end_ns, limit, what)
         if not there():
-            reached = f"{reader.finger() * 1e3:.1f} mm of {finger * 1e3:.0f} mm"
-            raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers stopped at {reached}")
+            text = f"{what}: the fingers stopped at {reader.finger() * 1e3:.1f} mm of {finger * 1e3:.0f} mm"
+            if reader.gap() < held + self._config.hand.lets_go:
+                raise OpenArmError(Code.EXECUTION_FAILED, text)
+            robot.warn(f"{text}, between other things")
 
     async def close(self, arm: str, what: str, force: float = 0.0) -> None:
         """Close the hand until it presses on something.

@@ -68,7 +68,7 @@ async def _leave(run: Run, grasp: Grasp, placed: Placed | None) -> None:
     if run.hand is Hand.HOLDING:
         await _put_back(run, grasp)
         run.hand = Hand.AT_OBJECT
-    await robot.open(arm, "open", grasp.candidate.opened)
+    await robot.open(arm, "open", grasp.candidate.opened, held=grasp.width)
     await robot.wait(config.timing.after_release)
     if at_object:
         await robot.move_linear(arm, se3.make(p=grasp.candidate.approach_offset) @ T_base_tcp, "back off")

@@ -15,7 +15,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.objects.resting import least_box_middles
 from openarm_common.types import Array
 from openarm_grasp.evidence import verdicts
-from openarm_grasp.evidence.shapes import Cluster, judge_moved, judge_rests
+from openarm_grasp.evidence.shapes import Cluster, is_more, judge_moved, judge_rests
 from openarm_grasp.evidence.verdicts import CameraVerdict
 from openarm_grasp.perception.clouds import came_next_to, cluster_frames, cluster_of, nearest_to, stands
 from openarm_grasp.perception.detections import NEXT_TO, Frame
@@ -99,7 +99,10 @@ def _gone_with_it(grasp: Grasp, frames: Sequence[Frame]) -> CameraVerdict | None
 def _seen_whole(
     frame: Frame, run: Run, grasp: Grasp, target: PlaceTarget, before: Cluster, T_base_now: Array
 ) -> CameraVerdict:
-    """Judge by one image what was seen whole before: it rests at its place as it rested."""
+    """Judge by one image what was seen whole before: it rests at its place as it rested.
+
+    What others may have hidden a part of, and is larger now, was seen in part.
+    """
     config, place = run.config, target.position
     tolerance = _SEEN_WITHIN * config.place.tolerance
     # next to others it may have been several things, or have lain on one: such come apart, or fall
@@ -112,7 +115,11 @@ def _seen_whole(
     expected = se3.apply(T_base_now, before.centroid)[:2]
     if now is not None and not leaned and float(np.linalg.norm(points[:, :2].mean(axis=0) - expected)) <= tolerance:
         return rested
-    return judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
+    known = object_points(grasp.sighting.clouds[-1:])
+    moved = judge_moved(known, T_base_now, points, config.held)
+    if moved.ok and is_more(points, known, T_base_now, config.held):
+        return _seen_in_part(frame, run, grasp, target, before, T_base_now)
+    return moved
 
 
 def _seen_in_part(

@@ -318,7 +318,7 @@ class World(Skills):
     def is_open(self, arm: str) -> bool:
         return self.gap >= 2.0 * (HAND.opening - self._config.hand.open_tolerance)
 
-    async def open(self, arm: str, what: str, aperture: float | None = None) -> None:
+    async def open(self, arm: str, what: str, aperture: float | None = None, *, held: float = np.inf) -> None:
         await self._grip(arm, HAND.opening if aperture is None else 0.5 * aperture, what)
 
     async def close(self, arm: str, what: str, force: float = 0.0) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -187,6 +188,24 @@ def test_a_gap_that_changes_on_the_way_is_a_slip_and_stops_the_carry() -> None:
     with pytest.raises(OpenArmError, match="the object slips: the gap went from") as error:
         carry(0.004)
     assert error.value.code is Code.GRASP_LOST
+
+
+@pytest.mark.requirement("R-17")
+@pytest.mark.parametrize(("grown", "holds", "free"), [(0.012, True, True), (0.008, True, False), (0.012, False, False)])
+def test_fingers_that_something_beside_them_stops_have_let_go(grown, holds, free) -> None:
+    """In a heap a hand cannot open wide where it has closed."""
+    run = trials(BOX)
+    assert ask(run, "blue", phase="pick").success
+    hand = run.skills._hands["left"]
+    gap = hand.gap()
+
+    async def grip(*_) -> bool:
+        hand.finger = lambda: 0.5 * (gap + grown)  # type: ignore[method-assign]
+        return False
+
+    run.link.grip = grip  # type: ignore[method-assign]
+    with nullcontext() if free else pytest.raises(OpenArmError, match="the fingers stopped at"):
+        run.link.run(run.skills.open("left", "open", held=gap if holds else np.inf))
 
 
 @pytest.mark.requirement("B-48")

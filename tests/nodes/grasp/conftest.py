@@ -56,6 +56,7 @@ class FakeGraph(Node):
         executed: Trajectories.
         goal_ids: Of motions.
         silent: No joint states any more.
+        blind: No detections any more.
     """
 
     def __init__(self, *, motion: bool = True, detector: bool = True) -> None:
@@ -64,7 +65,7 @@ class FakeGraph(Node):
         self._servers: list[ActionServer] = []
         self.robot = RobotDescription.load()
         self.t_ns = 5_000_000_000
-        self.silent = False
+        self.silent = self.blind = False
         self.slips, self.scene = 0, 1
         self.executed: list[JointTrajectory] = []
         self.unreachable = False
@@ -237,7 +238,7 @@ class FakeGraph(Node):
 
     # --- detector
     def _publish_detections(self) -> None:
-        if not self._detections.get_subscription_count():
+        if self.blind or not self._detections.get_subscription_count():
             return
         message = Detection3DArray()
         message.header.frame_id = BASE_FRAME
