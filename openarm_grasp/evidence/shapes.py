@@ -239,6 +239,8 @@ def judge_moved(before: Array, T_after_before: Array, now: Array, config: HeldCo
 def is_more(now: Array, before: Array, T_after_before: Array, config: HeldConfig) -> bool:
     """Whether more of a thing is seen than before, from above; arguments as `judge_moved`."""
     there = _upper(before @ T_after_before[:3, :3].T + T_after_before[:3, 3])
+    if not len(now) or not len(there):
+        return False
     away, _ = KDTree(there[:, :2]).query(_upper(now)[:, :2])
     return bool(np.percentile(away, _MOST) > config.moved)
 

@@ -65,21 +65,28 @@ async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
 def _judge_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]) -> CameraVerdict:
     """Judge what is no box by its points, and by the middle of what is seen now.
 
-    One image that shows it at its place is enough: of a thin thing another may show a part. Of what had turned in the
-    hand nothing is said: a part that is out of view may make up for a shift.
+    One image that shows it at its place is enough: of a thin thing another may show a part. What stood next to others,
+    and is larger in any image now, was seen in part. Of what had turned in the hand nothing is said: a part that is out
+    of view may make up for a shift.
     """
     if grasp.turned:
         return _unproven("it had turned or slipped in the hand: nothing shows that it is where it should be")
-    before = cluster_of(grasp.sighting)
-    T_base_now = grasp.motion_to(placed.target)
-    judge = _seen_in_part if before.cut else _seen_whole
+    before, target = cluster_of(grasp.sighting), placed.target
+    T_base_now = grasp.motion_to(target)
+    known, nearest = object_points(grasp.sighting.clouds[-1:]), (nearest_to((one,), target.position) for one in frames)
+    more = _was_next_to_others(grasp) and any(is_more(seen, known, T_base_now, run.config.held) for _, seen in nearest)
+    judge = _seen_in_part if before.cut or more else _seen_whole
     newest = CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
     for age, frame in enumerate(reversed(frames)):
-        verdict = judge(frame, run, grasp, placed.target, before, T_base_now)
+        verdict = judge(frame, run, grasp, target, before, T_base_now)
         if verdict.ok:
             return _gone_with_it(grasp, frames) or verdict
         newest = verdict if age == 0 else newest
     return newest
+
+
+def _was_next_to_others(grasp: Grasp) -> bool:
+    return any(gap(d, grasp.sighting.target) < NEXT_TO for d in grasp.sighting.others)
 
 
 def _unproven(text: str, *, final: bool = False) -> CameraVerdict:
@@ -99,14 +106,11 @@ def _gone_with_it(grasp: Grasp, frames: Sequence[Frame]) -> CameraVerdict | None
 def _seen_whole(
     frame: Frame, run: Run, grasp: Grasp, target: PlaceTarget, before: Cluster, T_base_now: Array
 ) -> CameraVerdict:
-    """Judge by one image what was seen whole before: it rests at its place as it rested.
-
-    What others may have hidden a part of, and is larger now, was seen in part.
-    """
+    """Judge by one image what was seen whole before: it rests at its place as it rested."""
     config, place = run.config, target.position
     tolerance = _SEEN_WITHIN * config.place.tolerance
     # next to others it may have been several things, or have lain on one: such come apart, or fall
-    leaned = any(gap(d, grasp.sighting.target) < NEXT_TO for d in grasp.sighting.others)
+    leaned = _was_next_to_others(grasp)
     rested = judge_rests(before, place, cluster_frames((frame,), place), tolerance, leaned=leaned)
     if not rested.ok:
         return rested
@@ -115,11 +119,7 @@ def _seen_whole(
     expected = se3.apply(T_base_now, before.centroid)[:2]
     if now is not None and not leaned and float(np.linalg.norm(points[:, :2].mean(axis=0) - expected)) <= tolerance:
         return rested
-    known = object_points(grasp.sighting.clouds[-1:])
-    moved = judge_moved(known, T_base_now, points, config.held)
-    if moved.ok and is_more(points, known, T_base_now, config.held):
-        return _seen_in_part(frame, run, grasp, target, before, T_base_now)
-    return moved
+    return judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
 
 
 def _seen_in_part(
