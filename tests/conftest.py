@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
+import signal
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
@@ -30,6 +31,8 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.pop(folder.ROBOT, None)  # a test that is about another robot than the default one says so
 os.environ.pop(zeros.ZEROS, None)
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # begun in the background of a script; commands would inherit it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A run of the suite draws the same examples every time and times none; `--hypothesis-profile=explore` draws new ones.
 hypothesis.settings.register_profile("suite", deadline=None, derandomize=True)
