@@ -225,7 +225,7 @@ def judge_moved(before: Array, T_after_before: Array, now: Array, config: HeldCo
         now: (n, 3) points of what is seen there now.
         config: Thresholds.
     """
-    there = _upper(before @ T_after_before[:3, :3].T + T_after_before[:3, 3])
+    there = _upper(se3.apply(T_after_before, before))
     if not len(now) or not len(there):
         return CameraVerdict(Code.PLACE_FAILED, "nothing is seen where it was put down")
     away, _ = KDTree(now).query(there)
@@ -238,7 +238,7 @@ def judge_moved(before: Array, T_after_before: Array, now: Array, config: HeldCo
 
 def is_more(now: Array, before: Array, T_after_before: Array, config: HeldConfig) -> bool:
     """Whether more of a thing is seen than before, from above; arguments as `judge_moved`."""
-    there = _upper(before @ T_after_before[:3, :3].T + T_after_before[:3, 3])
+    there = _upper(se3.apply(T_after_before, before))
     if not len(now) or not len(there):
         return False
     away, _ = KDTree(there[:, :2]).query(_upper(now)[:, :2])

@@ -22,6 +22,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.wanted import EASIEST, takes_all
 from openarm_grasp.perception.detections import SAME_PLACE
 from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.place import SAME_SPOT
 from openarm_grasp.requests.request import GraspRequest, Spot
 
 #: With these there is nothing more to ask for, whatever it is.
@@ -40,8 +41,6 @@ _UNSEEN, _IN_VAIN = 3, 10
 _MOST = 10
 #: Things that are pushed aside at most, one after the other in vain.
 _PUSHES = 3
-#: What is left so near to where something was left before is that, m.
-_SAME_SPOT = 0.02
 
 
 class Bin(Config):
@@ -235,7 +234,7 @@ class Order:
 
     def _may_push(self, label: str, where: Spot) -> bool:
         pushed = [one.request.object_at for one in self._in_vain if one.aside]
-        known = any(spot is not None and math.dist(where, spot[:2]) < _SAME_SPOT for spot in pushed)
+        known = any(spot is not None and math.dist(where, spot[:2]) < SAME_SPOT for spot in pushed)
         return takes_all(label) and len(pushed) < _PUSHES and not known
 
     def _enough(self, label: str) -> bool:
@@ -244,11 +243,11 @@ class Order:
 
     def _at(self, spot: Spot, label: str = "") -> Iterator[Left]:
         """What was left about there, of a label, or of any."""
-        near = (one for one in self.left if one.where is not None and math.dist(one.where, spot) < _SAME_SPOT)
+        near = (one for one in self.left if one.where is not None and math.dist(one.where, spot) < SAME_SPOT)
         return (one for one in near if label in ("", one.label))
 
     def _was_asked_for(self, where: Spot) -> bool:
-        return len(self._by_place) > 2 * _MOST or any(math.dist(where, spot) < _SAME_SPOT for spot in self._by_place)
+        return len(self._by_place) > 2 * _MOST or any(math.dist(where, spot) < SAME_SPOT for spot in self._by_place)
 
     def _spots(self, label: str) -> tuple[Spot, ...]:
         return () if self.bins is None else self.bins.bins[self.bins.of(label)].slots(self.bins.spacing)

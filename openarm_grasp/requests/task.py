@@ -61,11 +61,6 @@ class Grasp:
     adjacent: tuple[Detection, ...] = ()
 
     @property
-    def width(self) -> float:
-        """Gap at which the hand holds it, m."""
-        return self.candidate.width if self.closed is None else self.closed
-
-    @property
     def in_part(self) -> bool:
         """Whether there may be more of it than was seen."""
         return bool(self.adjacent) or not self.sighting.target.measured

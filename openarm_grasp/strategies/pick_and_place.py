@@ -389,7 +389,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
             raise OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}")
         run.enter(State.PLACE, gripper.reason)
         failure = await _lower(run, grasp, plan, target, last=last)
-        await robot.open(arm, "release", grasp.candidate.opened, held=grasp.width)
+        await robot.open(arm, "release", grasp.candidate.opened, held=evidence.gap)
     except OpenArmError as error:
         if error.code is Code.GRASP_LOST:
             run.hand = Hand.FREE

@@ -37,10 +37,10 @@ async def retreat(run: Run, grasp: Grasp, placed: Placed | None) -> None:
         OpenArmError: When the hand holds the object and finds none, or the arm does not do what was planned.
     """
     run.robot.stop_observing()
-    failure = run.failure if placed is None else placed.failure
+    failure, held = run.failure if placed is None else placed.failure, run.robot.aperture(grasp.arm)
     for last, obstacles in ((False, _obstacles(run, grasp, placed)), (True, ())):
         try:
-            await _leave(run, grasp, placed)
+            await _leave(run, grasp, placed, held)
             await run.robot.go_home((grasp.arm,), obstacles)
             return
         except OpenArmError as error:
@@ -56,8 +56,8 @@ async def retreat(run: Run, grasp: Grasp, placed: Placed | None) -> None:
             run.enter(State.RESET, f"{error.message}; trying another way home")
 
 
-async def _leave(run: Run, grasp: Grasp, placed: Placed | None) -> None:
-    """Free the hand and bring it away from the object on a straight line."""
+async def _leave(run: Run, grasp: Grasp, placed: Placed | None, held: float) -> None:
+    """Free the hand, which may hold the object with that gap, m, and bring it away on a straight line."""
     arm, robot, config, T_base_tcp = grasp.arm, run.robot, run.config, grasp.candidate.T_base_tcp
     if placed is not None:
         if run.hand is Hand.RELEASED:
@@ -68,7 +68,7 @@ async def _leave(run: Run, grasp: Grasp, placed: Placed | None) -> None:
     if run.hand is Hand.HOLDING:
         await _put_back(run, grasp)
         run.hand = Hand.AT_OBJECT
-    await robot.open(arm, "open", grasp.candidate.opened, held=grasp.width)
+    await robot.open(arm, "open", grasp.candidate.opened, held=held)
     await robot.wait(config.timing.after_release)
     if at_object:
         await robot.move_linear(arm, se3.make(p=grasp.candidate.approach_offset) @ T_base_tcp, "back off")
