@@ -19,15 +19,22 @@ from typing import Any
 
 from action_msgs.msg import GoalStatusArray
 from rclpy import action
+from rclpy.action.server import ServerGoalHandle
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.event_handler import QoSLivelinessChangedInfo, SubscriptionEventCallbacks
+from rclpy.executors import await_or_execute
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.lifeline import Lifeline, lives, watch
+
+#: What the middleware could not do.
+RCLError: type[Exception] = rclpy_implementation.RCLError
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,10 @@ def alive_topic(node_name: str) -> str:
 #: A process of this machine that lives and is silent for so much longer than the lease counts as gone, s: it is
 #: stopped, or hangs. Fast DDS halts a process for a second or two when another one that it writes to was killed.
 _SILENT_S = 3.0
+#: An answer that could not be sent is sent again after this, s: a try holds the node up for 0.1 s.
+_ANSWER_S = 0.5
+#: So often; DDS discovers a client that exists within some of them.
+_ANSWERS = 40
 #: Lifelines of this process by participant of the middleware.
 _LIFELINES: dict[str, _ParticipantLifeline] = {}
 
@@ -228,12 +239,51 @@ class Watch:
 
 
 class ActionServer(action.ActionServer):
-    """An action server whose clients notice its death; arguments as `rclpy.action.ActionServer`."""
+    """An action server whose clients notice its death; arguments as `rclpy.action.ActionServer`.
+
+    The middleware cannot answer a client that it has not discovered yet (ros2/rmw_fastrtps#842), and rclpy never
+    executes a goal whose answer was not sent. This one does, and sends the answer until the client is there.
+    """
 
     def __init__(self, node: Node, kind: Any, name: str, execute: Callable[..., Any], **kwargs: Any) -> None:
         status = LEASE.offer(latest())
         super().__init__(node, kind, name, execute, status_pub_qos_profile=status, **kwargs)
+        self._answered: set[bytes] = set()
+        self._on_accepted, self._handle_accepted_callback = self._handle_accepted_callback, self._begin
         show_life(node, f"{node.resolve_topic_name(name)}/_action/status")
+
+    async def _begin(self, goal: ServerGoalHandle) -> None:
+        """Begin to execute a goal; its answer is sent."""
+        self._answered.add(bytes(goal.goal_id.uuid))
+        await await_or_execute(self._on_accepted, goal)
+
+    async def _execute_goal_request(self, request_header_and_message: Any) -> None:
+        header, request = request_header_and_message
+        key = bytes(request.goal_id.uuid)
+        again = key in self._goal_handles
+        await super()._execute_goal_request(request_header_and_message)
+        goal = self._goal_handles.get(key)
+        if key not in self._answered and goal is not None and not again:
+            self._answer_later(header)
+            self._handle.publish_status()
+            await await_or_execute(self._on_accepted, goal)
+        self._answered.discard(key)
+
+    def _answer_later(self, header: Any) -> None:
+        """Send the answer to an accepted goal until it is sent, or the client counts as gone."""
+        answer = self._action_type.Impl.SendGoalService.Response(accepted=True)
+        left = _ANSWERS
+
+        def send() -> None:
+            nonlocal left
+            left -= 1
+            with suppress(RCLError):
+                self._handle.send_goal_response(header, answer)
+                left = 0
+            if left == 0:
+                self._node.destroy_timer(timer)
+
+        timer = self._node.create_timer(_ANSWER_S, send, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 class ActionClient(action.ActionClient):

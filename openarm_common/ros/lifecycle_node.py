@@ -7,13 +7,11 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from openarm_common.errors import OpenArmError
+from openarm_common.ros.actions import RCLError
 from openarm_common.ros.node import BaseNode, ConfigT
-
-RCLError: type[Exception] = rclpy_implementation.RCLError
 
 
 class ManagedNode(LifecycleNodeMixin, BaseNode[ConfigT]):

@@ -27,7 +27,6 @@ from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -39,7 +38,7 @@ from openarm_common.config import AT_RUN_TIME, Config, validate
 from openarm_common.errors import OpenArmError
 from openarm_common.printable import brief
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.actions import LEASE, alive_topic, latest, show_life
+from openarm_common.ros.actions import LEASE, RCLError, alive_topic, latest, show_life
 from openarm_common.ros.log import PrintableLogger
 
 ConfigT = TypeVar("ConfigT", bound=Config)
@@ -96,7 +95,7 @@ def until_shutdown(context: Context) -> Iterator[None]:
     """Let publishing in a thread fail when a signal has shut the context down in the meantime."""
     try:
         yield
-    except rclpy_implementation.RCLError:
+    except RCLError:
         if context.ok():
             raise
 
@@ -361,7 +360,7 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
         code = 1
     except ExternalShutdownException:
         pass  # the normal end
-    except (rclpy_implementation.RCLError, TypeError):  # the latter from an executor in a context that has ended
+    except (RCLError, TypeError):  # the latter from an executor in a context that has ended
         if rclpy.ok():
             raise
         # The signal came while something of rcl was being made.

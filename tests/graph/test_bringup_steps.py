@@ -14,7 +14,6 @@ import pytest
 import rclpy
 from control_msgs.action import ParallelGripperCommand
 from openarm_interfaces.action import MoveArm
-from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -22,6 +21,7 @@ from sensor_msgs.msg import JointState
 from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import Marker, MarkerArray
 
+from openarm_common.ros.actions import ActionClient
 from openarm_common.scene.scene import load_scene
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow]

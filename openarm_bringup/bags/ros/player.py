@@ -23,9 +23,9 @@ from openarm_bringup.messages import interface
 from openarm_bringup.supervision.environment import profiled, write_profile
 from openarm_bringup.supervision.graph import NodeSpec
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.actions import RCLError
 from openarm_common.ros.client import ContextNode
 from openarm_common.ros.convert import ns_to_stamp
-from openarm_common.ros.lifecycle_node import RCLError
 
 _CLOCK = "/clock"
 #: What comes from a robot and its cameras: two of them in one graph would be taken for one that jumps.
