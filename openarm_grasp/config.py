@@ -239,6 +239,10 @@ class PushConfig(Config):
     aside: tuple[float, ...] = Field(
         default=(0.20, 0.15, 0.10, 0.06), description="lengths of a push aside that are tried, the longest first, m"
     )
+    levels: tuple[float, ...] = Field(
+        default=(0.0, 0.03, 0.06, 0.09),
+        description="heights above the table at which the hand pushes what lies on other things, in this order, m",
+    )
     directions: int = Field(default=12, ge=1, le=72, description="directions of a push that are tried")
     gap: float = Field(default=0.012, ge=0.005, le=0.05, description="hand to object before it is pushed, m")
     tilts_deg: tuple[float, ...] = Field(

@@ -37,6 +37,8 @@ _TIPS = 0.03
 _ROW, _MEET = 0.006, 0.004
 #: Things are not pushed farther than this beyond where arms reach, and no farther than this at once, m.
 _BEYOND, _LONGEST = 0.05, 0.30
+#: What is pushed over other things is taken for so much shorter below: they may reach a little higher, m.
+_OVER = 0.01
 #: Share of a line by which what stands where no arm reaches must come nearer to there.
 _COMES = 0.5
 #: A line away from the middle of the crowd may be so much longer, m.
@@ -51,7 +53,8 @@ class Sweep:
         met: Box about what the hand meets on it.
         end: (2,) where the middle of that box goes.
         freed: (2,) where the object should be afterwards.
-        heap: Boxes about the object and all that is pushed along with it.
+        heap: Boxes about the object and all that is pushed along with it, as far as it is at the height of the hand.
+        under: Boxes about the same down to the table.
         rest: What else stands around.
     """
 
@@ -59,11 +62,18 @@ class Sweep:
     end: Array
     freed: Array
     heap: tuple[Box, ...]
+    under: tuple[Box, ...]
     rest: tuple[Detection, ...]
 
 
 def sweeps(
-    found: Sighting, hand: Array, context: GraspContext, lengths: Sequence[float], *, longest: bool = False
+    found: Sighting,
+    hand: Array,
+    context: GraspContext,
+    lengths: Sequence[float],
+    *,
+    level: float = 0.0,
+    longest: bool = False,
 ) -> tuple[Sweep, ...]:
     """Find lines that push an object away from where it stands, those first that move, and end next to, the least else.
 
@@ -75,11 +85,17 @@ def sweeps(
         hand: Points (n, 3) of the closed hand, TCP frame.
         context: Parameters and table.
         lengths: Of the way of the object, m.
+        level: Height of the hand above the table, m: it goes over what is lower, and meets what lies on that.
         longest: Of lines that move as many things the longest come first, else short ones that lead outwards.
     """
-    config, floor = context.config, context.table.top_z
-    things, around = [_standing(object_points(found.clouds), found.target, floor)], points_around(found.clouds)
-    things += [_standing(around[in_box(around, one)], one, floor) for one in found.others]
+    config, table = context.config, context.table.top_z
+    floor, around = table + level, points_around(found.clouds)
+    standing = {0: _standing(object_points(found.clouds), found.target, floor)}
+    standing |= {i: _standing(around[in_box(around, one)], one, floor) for i, one in enumerate(found.others, start=1)}
+    if not len(standing[0]) or (level > 0.0 and standing[0][:, 2].max() < floor + 2.0 * _OVER):
+        return ()
+    numbers = [i for i, cells in standing.items() if len(cells)]
+    things = [standing[i] for i in numbers]
     half = float(np.abs(hand[hand[:, 2] > hand[:, 2].max() - _TIPS, :2]).max()) + _MEET
     room = 2.0 * (half + config.push.gap)
     crowd = np.concatenate(things)[:, :2].mean(axis=0)
@@ -103,9 +119,11 @@ def sweeps(
         p = R @ np.array([0.5 * (begin + far), aside, 0.0])
         size = np.array([far - begin + _GRAIN, 2.0 * half, tall])
         box = replace(found.target, T_base_object=se3.make(R, p + (floor + 0.5 * tall) * UP), size=size, round=False)
-        heap = standing_boxes(found.target.label, cells, floor, config.approach.table_gap)
-        rest = tuple(one for i, one in enumerate(found.others, start=1) if i not in moved)
-        sweep = Sweep(box, p[:2] + whole * ahead, found.target.p_base[:2] + length * ahead, heap, rest)
+        heap = standing_boxes(found.target.label, cells, floor, config.approach.table_gap if level == 0.0 else _OVER)
+        under = standing_boxes(f"{found.target.label}/under", cells, table, 0.0) if level > 0.0 else ()
+        along = {numbers[i] for i in moved}
+        rest = tuple(one for i, one in enumerate(found.others, start=1) if i not in along)
+        sweep = Sweep(box, p[:2] + whole * ahead, found.target.p_base[:2] + length * ahead, heap, under, rest)
         out = float(ahead @ direction(things[0][:, :2].mean(axis=0) - crowd))
         ends = KDTree(cells[:, :2] + whole * ahead)
         near = sum(ends.query(one[:, :2])[0].min() < NEXT_TO for i, one in enumerate(things) if i not in moved)
@@ -114,13 +132,13 @@ def sweeps(
 
 
 def _standing(points: Array, one: Detection, floor: float) -> Array:
-    """Highest points (n, 3) of the columns of an object; of the box about it where no points of it are known."""
-    points = points[points[:, 2] > floor + _MEET]
+    """Highest points (n, 3) above a height of the columns of an object; of its box where no points of it are known."""
     if len(points) == 0:
         edges = [np.linspace(-0.5, 0.5, max(2, round(edge / _GRAIN) + 1)) * edge for edge in one.size[:2]]
         grid = np.stack(np.meshgrid(*edges, [0.5 * one.size[2]], indexing="ij"), axis=-1).reshape(-1, 3)
         points = se3.apply(one.T_base_object, grid)
-    return tops(points)
+    points = points[points[:, 2] > floor + _MEET]
+    return tops(points) if len(points) else points
 
 
 def _line(

@@ -156,7 +156,12 @@ class Skills:
         return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone, start))
 
     async def plan_sweep(
-        self, arm: str, ways: Sequence[GraspCandidate], found: Sighting, heap: tuple[Box, ...]
+        self,
+        arm: str,
+        ways: Sequence[GraspCandidate],
+        found: Sighting,
+        heap: tuple[Box, ...],
+        under: tuple[Box, ...] = (),
     ) -> Planned:
         """Plan a closed hand through several things that go with it.
 
@@ -164,9 +169,10 @@ class Skills:
             arm: Whose.
             ways: The candidates.
             found: What stands around them.
-            heap: Boxes about them.
+            heap: Boxes about them, as far as the hand meets them.
+            under: Boxes about all of them: what the map shows there is no obstacle.
         """
-        return await self.plan(PlanGrasp(arm, tuple(ways), neighbours(found, heap, self._config), heap))
+        return await self.plan(PlanGrasp(arm, tuple(ways), neighbours(found, heap, self._config), heap, under))
 
     async def plan_place(
         self,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, product
 
 import numpy as np
 
@@ -72,7 +72,7 @@ class Push:
 async def plan_sweep(
     task: Task, found: Sighting, avoid: Sequence[Array], lengths: Sequence[float], *, longest: bool = False
 ) -> Push:
-    """Find a line that pushes an object along with what it meets.
+    """Find a line that pushes an object along with what it meets; off what it lies on, where the table leaves no room.
 
     Args:
         task: That it is a part of.
@@ -86,18 +86,18 @@ async def plan_sweep(
     """
     context, robot, faults = task.context, task.robot, list[str]()
     start = found.target.p_base[:2]
-    for arm in context.arm_order(task.request.arm, float(start[1])):
+    arms, levels = context.arm_order(task.request.arm, float(start[1])), context.config.push.levels
+    for level, arm in product(levels, arms):
         hand = closed_hand(robot.description, arm)
-        lines = (
-            one for one in sweeps(found, hand, context, lengths, longest=longest) if is_open(one.freed - start, avoid)
-        )
+        found_lines = sweeps(found, hand, context, lengths, level=level, longest=longest)
+        lines = (one for one in found_lines if is_open(one.freed - start, avoid))
         for sweep in islice(lines, _SWEEPS * len(lengths)):
             ways = push_ways(sweep.met, sweep.end, context.config, hand, context.hand, _TURNS)
             if not ways:
                 faults.append(f"{arm} hand: what stands there is too thin for it")
                 continue
             try:
-                plan = await robot.plan_sweep(arm, ways, replace(found, others=sweep.rest), sweep.heap)
+                plan = await robot.plan_sweep(arm, ways, replace(found, others=sweep.rest), sweep.heap, sweep.under)
             except OpenArmError as error:
                 if error.code not in NO_WAY:
                     raise

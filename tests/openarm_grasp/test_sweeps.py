@@ -148,3 +148,23 @@ def test_a_thin_heap_is_not_swept() -> None:
     flat = [replace(one, T_base_object=se3.make(p=(*one.p_base[:2], 0.402))) for one in flat]
     for sweep in sweeps(crowd(*flat), hand(), CONTEXT, LENGTHS):
         assert push_ways(sweep.met, sweep.end, CONFIG, hand(), HAND) == ()
+
+
+@pytest.mark.requirement("R-17")
+def test_what_lies_over_others_is_pushed_off_them_above_their_tops() -> None:
+    low = [standing(f"low{k}", 0.28 + 0.12 * np.cos(k), 0.15 + 0.12 * np.sin(k)) for k in range(7)]
+    size = np.array([0.2, 0.2, 0.08])
+    lid = replace(standing("lid", 0.28, 0.15), T_base_object=se3.make(p=(0.28, 0.15, low[0].top + 0.04)), size=size)
+    heap, lengths = crowd(lid, *low), CONFIG.push.aside
+    assert all(len(one.rest) < len(low) - 3 for one in sweeps(heap, hand(), CONTEXT, lengths))
+    level = next(one for one in CONFIG.push.levels if one >= low[0].size[2])
+    lines = sweeps(heap, hand(), CONTEXT, lengths, level=level)
+    assert lines
+    for sweep in lines:
+        assert sweep.rest == heap.others
+        assert sweep.met.bottom == pytest.approx(CONTEXT.table.top_z + level)
+        assert all(box.T_frame_box[2, 3] - 0.5 * box.size[2] > low[0].top for box in sweep.heap)
+        assert min(box.T_frame_box[2, 3] - 0.5 * box.size[2] for box in sweep.under) < low[0].top - 0.03
+        for way in push_ways(sweep.met, sweep.end, CONFIG, hand(), HAND):
+            assert way.T_base_tcp[2, 3] > low[0].top
+    assert sweeps(heap, hand(), CONTEXT, lengths, level=0.15) == ()  # the hand would go over it
