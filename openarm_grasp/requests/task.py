@@ -49,6 +49,7 @@ class Grasp:
         turned: The camera has seen it turned or slipped in the hand, which does not put it where it should be then.
         heavy: (2,) direction of the end that hung lower than it should, base frame, as the object lay; None: not seen.
         adjacent: What lay so near that it may be a part of it.
+        merged: What was seen as another thing among others and rose with it: both may be one, or be held together.
     """
 
     arm: str
@@ -59,6 +60,7 @@ class Grasp:
     turned: bool = False
     heavy: Array | None = None
     adjacent: tuple[Detection, ...] = ()
+    merged: tuple[Detection, ...] = ()
 
     @property
     def in_part(self) -> bool:

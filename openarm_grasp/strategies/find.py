@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 _SHORTEST = 0.35
 #: A grasp that costs so much more than another for its distance from the weight comes after it, on any line.
 _FAR_FROM_WEIGHT = 0.8
+#: The middle of two things is that of the one where it is no farther off, m; things so near to them are a heap, m.
+_ONE_MIDDLE, _AMONG = 0.01, 0.15
 #: An object that is observed so may be trusted in the next frames.
 _NOT_TRUSTED = (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT, Code.STALE_DATA)
 
@@ -327,13 +329,17 @@ def grasp_of(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) 
 
 def regrasped(run: Run, grasp: Grasp, sighting: Sighting) -> Grasp:
     """A grasp of an object of which other points turned out to be its own."""
-    candidate, label, gap = grasp.candidate, sighting.target.label, run.config.approach.table_gap
+    candidate, label, table_gap = grasp.candidate, sighting.target.label, run.config.approach.table_gap
     if candidate.held:
-        made = standing_boxes(label, object_points(sighting.clouds[-1:]), sighting.target.bottom, gap)
+        made = standing_boxes(label, object_points(sighting.clouds[-1:]), sighting.target.bottom, table_gap)
         # up to a column too high, besides
         candidate = replace(candidate, held=tuple(eased(box, 2.0 * EASED) for box in made))
     run.findings.sighting, run.place_plan = sighting, None
-    return replace(grasp_of(run, grasp.arm, sighting, candidate), closed=grasp.closed)
+    before, now, merged = grasp.sighting, sighting.target, tuple[Detection, ...]()
+    shift = float(np.linalg.norm((now.p_base - before.target.p_base)[:2]))
+    if shift > _ONE_MIDDLE and any(gap(d, now) < _AMONG for d in sighting.others):
+        merged = tuple(d for d in before.others if d.measured and all(d is not one for one in sighting.others))
+    return replace(grasp_of(run, grasp.arm, sighting, candidate), closed=grasp.closed, merged=merged)
 
 
 async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> tuple[Planned, PlaceTarget]:

@@ -96,11 +96,12 @@ def _unproven(text: str, *, final: bool = False) -> CameraVerdict:
 def _gone_with_it(grasp: Grasp, frames: Sequence[Frame]) -> CameraVerdict | None:
     """Return why the middle of what is seen is not known after all; None where nothing has gone with it."""
     torn = next((d for d in grasp.adjacent if not stands(d, frames)), None)
-    if torn is None:
+    if torn is None and not grasp.merged:
         return None
-    x, y = torn.p_base[:2]
-    text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it is a part of it, and its middle"
-    return _unproven(f"{text} is not known", final=True)
+    d, what = (torn, "is a part of it") if torn is not None else (grasp.merged[0], "may be another thing")
+    x, y = d.p_base[:2]
+    text = f"what lay next to it at ({x:.3f}, {y:.3f}) m has gone with it: it {what}, and its middle is not known"
+    return _unproven(text, final=True)
 
 
 def _seen_whole(

@@ -186,7 +186,8 @@ def test_what_has_gone_with_what_a_hand_keeps_may_be_a_part_of_it() -> None:
     assert "has gone with it: it is a part of it" in outcome.message
 
 
-def test_what_was_seen_as_two_things_and_rises_as_one_is_placed_as_one(monkeypatch) -> None:
+@pytest.mark.parametrize("among", [False, True])
+def test_what_was_seen_as_two_things_and_rises_as_one_is_placed_as_one_where_it_was_alone(monkeypatch, among) -> None:
     """One end of the wrench is taken for another thing, in the observation before the grasp alone."""
 
     def split(run: Run, frames: Sequence[Frame]) -> Sighting:
@@ -194,14 +195,17 @@ def test_what_was_seen_as_two_things_and_rises_as_one_is_placed_as_one(monkeypat
         if run.tried:
             return found
         size, long = found.target.size.copy(), int(np.argmax(found.target.size[:2]))
-        end = found.target.T_base_object @ se3.make(p=0.4 * size[long] * np.eye(3)[long])
-        size[long] *= 0.2
-        part = replace(found.target, T_base_object=end, size=size, score=0.5)
+        rest, end = (found.target.T_base_object @ se3.make(p=p * size[long] * np.eye(3)[long]) for p in (-0.1, 0.4))
+        ratio = np.where(np.arange(3) == long, 0.2, 1.0)
+        part = replace(found.target, T_base_object=end, size=ratio * size, score=0.5)
+        target = replace(found.target, T_base_object=rest, size=np.where(ratio < 1.0, 0.8, 1.0) * size)
         clouds = []
         for cloud in found.clouds:
             away = in_box(cloud.points, part) & (cloud.labels == 1)
             clouds.append(replace(cloud, labels=np.where(away, 2, cloud.labels).astype(np.uint32)))
-        found = replace(found, others=(part,), clouds=tuple(clouds))
+        away = se3.make(p=(0.0, 0.14, 0.0)) @ found.target.T_base_object
+        others = (part, replace(part, T_base_object=away, size=np.full(3, 0.02))) if among else (part,)
+        found = replace(found, target=target, others=others, clouds=tuple(clouds))
         run.findings.sighting = found
         return found
 
@@ -210,5 +214,10 @@ def test_what_was_seen_as_two_things_and_rises_as_one_is_placed_as_one(monkeypat
     senses = SimulatedSenses(depth_noise=True, detector="anything")
     trials = Trials(Task("nominal", 1, alone("wrench", 0.27, -0.22, 0.4), ("anything",)), senses, GraspConfig())
     (grasp,) = trials.run()["grasps"]
-    assert grasp["outcome"] == "placed", grasp["message"]
     assert grasp["attempts"] == 1, [step.reason for step in trials.steps]
+    assert grasp["placed"]
+    if among:
+        assert grasp["code"] == "PLACE_FAILED"
+        assert "has gone with it: it may be another thing" in grasp["message"]
+    else:
+        assert grasp["code"] == "OK", grasp["message"]
