@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from action_msgs.msg import GoalStatusArray
+from action_msgs.msg import GoalStatus, GoalStatusArray
 from rclpy import action
-from rclpy.action.server import ServerGoalHandle
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
@@ -248,14 +247,7 @@ class ActionServer(action.ActionServer):
     def __init__(self, node: Node, kind: Any, name: str, execute: Callable[..., Any], **kwargs: Any) -> None:
         status = LEASE.offer(latest())
         super().__init__(node, kind, name, execute, status_pub_qos_profile=status, **kwargs)
-        self._answered: set[bytes] = set()
-        self._on_accepted, self._handle_accepted_callback = self._handle_accepted_callback, self._begin
         show_life(node, f"{node.resolve_topic_name(name)}/_action/status")
-
-    async def _begin(self, goal: ServerGoalHandle) -> None:
-        """Begin to execute a goal; its answer is sent."""
-        self._answered.add(bytes(goal.goal_id.uuid))
-        await await_or_execute(self._on_accepted, goal)
 
     async def _execute_goal_request(self, request_header_and_message: Any) -> None:
         header, request = request_header_and_message
@@ -263,11 +255,11 @@ class ActionServer(action.ActionServer):
         again = key in self._goal_handles
         await super()._execute_goal_request(request_header_and_message)
         goal = self._goal_handles.get(key)
-        if key not in self._answered and goal is not None and not again:
+        # not begun: rclpy has given it up
+        if goal is not None and not again and goal.status == GoalStatus.STATUS_ACCEPTED:
             self._answer_later(header)
             self._handle.publish_status()
-            await await_or_execute(self._on_accepted, goal)
-        self._answered.discard(key)
+            await await_or_execute(self._handle_accepted_callback, goal)
 
     def _answer_later(self, header: Any) -> None:
         """Send the answer to an accepted goal until it is sent, or the client counts as gone."""
