@@ -27,7 +27,7 @@ from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, watch_clearance
-from openarm_evaluation.judging.judge import RULES, at_rest, end_of, judge, rise_of
+from openarm_evaluation.judging.judge import RULES, judge, rests, rise_of
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial, choose_targets
 from openarm_grasp.config import GraspConfig
@@ -254,8 +254,7 @@ class Trials:
         least_ns = self.robot.t_ns + round(1.2 * RULES.rest * 1e9)
         while self.robot.t_ns < end_ns:
             self.robot.tick()
-            ends = [end_of(self.robot.tracks[name]) for name in names]
-            if self.robot.t_ns > least_ns and all(at_rest(sample) for end in ends for sample in end):
+            if self.robot.t_ns > least_ns and all(rests(self.robot.tracks[name]) for name in names):
                 return
 
 

@@ -15,7 +15,7 @@ from openarm_common.detection import Detection, kind_of
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, SceneObject
 from openarm_common.wanted import describe, select
-from openarm_evaluation.judging.judge import RULES, Sample, Verdict, at_rest, end_of, judge
+from openarm_evaluation.judging.judge import Sample, Verdict, at_rest, judge, rests
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 
@@ -269,8 +269,7 @@ def _wait_rest(observer: Observer, name: str) -> None:
 
     def resting() -> bool:
         track = observer.track(name)
-        long_enough = bool(track) and track[-1].t_ns - track[0].t_ns > RULES.rest * 1e9
-        return long_enough and all(map(at_rest, end_of(track)))
+        return bool(track) and rests(track)
 
     try:
         observer.wait(resting, 5.0, f"{name} at rest")

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from openarm_evaluation.judging.judge import JudgeConfig, Sample, at_rest, judge
+from openarm_evaluation.judging.judge import JudgeConfig, Sample, at_rest, judge, rests
 
 TARGET = (0.3, -0.2)
 
@@ -30,7 +31,7 @@ def good_track(dx: float = 0.004, roll: float = 0.0, z: float = 0.43, speed: flo
         sample(0.0, 0.2, -0.1, 0.43),
         sample(5.0, 0.2, -0.1, top, speed=0.1),
         sample(9.0, 0.3, -0.2, 0.45, speed=0.05),
-        *(sample(10.0 + 0.05 * i, 0.3 + dx, -0.2, z, roll, speed, yaw=1.0) for i in range(20)),
+        *(sample(10.0 + t, 0.3 + dx - speed * (0.95 - t), -0.2, z, roll, speed, yaw=1.0) for t in 0.05 * np.arange(20)),
     ]
 
 
@@ -50,7 +51,7 @@ def test_placed_upright_at_rest_within_tolerance() -> None:
         ({"roll": math.radians(15)}, "tilted by 15 degrees"),
         ({"roll": math.pi / 2}, "tilted by 90 degrees"),
         ({"z": 0.49}, r"centre is \+60 mm higher"),
-        ({"speed": 0.02}, "not at rest: 20 mm/s"),
+        ({"speed": 0.003}, r"not at rest: it moved 1.5 mm and 0.0 degrees in the last 0.5 s"),
         ({"top": 0.45}, "never lifted: it rose 20 mm"),
     ],
 )
@@ -94,6 +95,19 @@ def test_empty_or_disordered_track_is_refused() -> None:
         judge([], TARGET, claimed=False)
     with pytest.raises(ValueError, match="order of time"):
         judge(list(reversed(good_track())), TARGET, claimed=False)
+
+
+def test_what_a_solver_rocks_by_hundredths_of_a_millimetre_is_at_rest_and_what_turns_on_its_place_is_not() -> None:
+    fast = {"linear": np.array([0.007, 0.0, 0.0]), "angular": np.array([0.0, 0.33, 0.0])}
+    step = np.array([4e-5, 0.0, 0.0])
+    rocking = [replace(one, p_world=one.p_world + (-1) ** i * step, **fast) for i, one in enumerate(good_track())]
+    assert judge(rocking, TARGET, claimed=True).placed
+    assert rests(rocking)
+    assert not at_rest(rocking[-1])
+    turning = [*good_track()[:3], *(sample(10.0 + t, *TARGET, 0.43, yaw=0.1 * t) for t in 0.05 * np.arange(20))]
+    assert "0.0 mm and 2.9 degrees" in judge(turning, TARGET, claimed=True).reasons[0]
+    assert not rests(turning)
+    assert not rests(turning[:1])
 
 
 def test_at_rest_looks_at_both_velocities() -> None:
