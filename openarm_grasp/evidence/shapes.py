@@ -214,7 +214,7 @@ def judge_unmoved(before: Array, now: Array, config: HeldConfig, around: Array) 
     return True, "the object still stands there"
 
 
-def judge_moved(before: Array, T_after_before: Array, now: Array, config: HeldConfig) -> CameraVerdict:
+def judge_moved(before: Array, T_after_before: Array, now: Array, tolerance: float) -> CameraVerdict:
     """Whether what was seen of a thing is seen where the hand has moved it to; the thing may have been seen in part.
 
     The upper side is compared: of other sides a camera over the table sees more or less from place to place.
@@ -223,26 +223,26 @@ def judge_moved(before: Array, T_after_before: Array, now: Array, config: HeldCo
         before: (n, 3) points of it before the grasp.
         T_after_before: (4, 4) how the hand has moved it.
         now: (n, 3) points of what is seen there now.
-        config: Thresholds.
+        tolerance: Greatest distance, m.
     """
     there = _upper(se3.apply(T_after_before, before))
     if not len(now) or not len(there):
         return CameraVerdict(Code.PLACE_FAILED, "nothing is seen where it was put down")
     away, _ = KDTree(now).query(there)
-    off, limit = 1e3 * float(np.percentile(away, _MOST)), 1e3 * config.moved
+    off, limit = 1e3 * float(np.percentile(away, _MOST)), 1e3 * tolerance
     if off > limit:
         text = f"what was seen of it is {off:.0f} mm from where it was put down, expected at most {limit:.0f} mm"
         return CameraVerdict(Code.PLACE_FAILED, text)
     return CameraVerdict(Code.OK, f"what was seen of it is within {off:.0f} mm of where it was put down")
 
 
-def is_more(now: Array, before: Array, T_after_before: Array, config: HeldConfig) -> bool:
+def is_more(now: Array, before: Array, T_after_before: Array, tolerance: float) -> bool:
     """Whether more of a thing is seen than before, from above; arguments as `judge_moved`."""
     there = _upper(se3.apply(T_after_before, before))
     if not len(now) or not len(there):
         return False
     away, _ = KDTree(there[:, :2]).query(_upper(now)[:, :2])
-    return bool(np.percentile(away, _MOST) > config.moved)
+    return bool(np.percentile(away, _MOST) > tolerance)
 
 
 def _upper(points: Array) -> Array:

@@ -117,6 +117,12 @@ def symmetry(target: Detection) -> float:
     return np.pi / 2.0 if abs(float(target.size[0] - target.size[1])) < SQUARE_WITHIN else np.pi
 
 
+def other_spots(ways: Sequence[PlaceTarget], used: Sequence[PlaceTarget]) -> tuple[PlaceTarget, ...]:
+    """Ways to put something down at spots where none has failed; all of them, where there is no other spot."""
+    others = tuple(way for way in ways if not _failed(used, way.position, way.yaw_offset, any_turn=True))
+    return others or tuple(ways)
+
+
 def _failed(used: Sequence[PlaceTarget], spot: Array, yaw: float, *, any_turn: bool) -> bool:
     return any(
         np.linalg.norm(t.position[:2] - spot[:2]) < SAME_SPOT and (any_turn or abs(t.yaw_offset - yaw) < 1e-6)

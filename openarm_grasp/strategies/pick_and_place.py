@@ -28,7 +28,7 @@ from openarm_grasp.perception.sightings import object_points, points_around
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.planning.place import place_targets
+from openarm_grasp.planning.place import other_spots, place_targets
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.requests.states import Hand, State
 from openarm_grasp.requests.task import Grasp, Placed, Task
@@ -338,7 +338,7 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
         OpenArmError: GRASP_LOST.
     """
     run.tried += run.kept is not None
-    ways, failure = grasp.places, None
+    ways, failure, met = grasp.places, None, False
     while True:
         try:
             placed = await _put_down(run, grasp, ways, why, last=run.kept is not None or failure is not None)
@@ -348,8 +348,11 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
             if error.code is Code.GRASP_LOST:
                 raise
             if run.kept is not None or failure is not None:
-                if grasp.turned or error.code not in NO_WAY:
-                    raise ObjectKeptError(Code.PLACE_FAILED, still_held(run, error)) from error
+                if met or error.code is not Code.EXECUTION_FAILED:
+                    if grasp.turned or error.code not in NO_WAY:
+                        raise ObjectKeptError(Code.PLACE_FAILED, still_held(run, error)) from error
+                else:  # what it has met on the way there it may not meet on the way to another spot
+                    met, ways = True, other_spots(ways, run.used_places)
                 # with its hand in the way, or other things: it may hang otherwise than is known
                 grasp, why = replace(grasp, turned=True), f"{error.message}; as what has turned in the hand"
                 continue

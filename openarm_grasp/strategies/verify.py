@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 #: Share of the tolerance of a place in which the middle of any shape must be seen: it may be millimetres elsewhere.
 _SEEN_WITHIN = 0.75
+#: Share of what counts as moved within which what may be a part must be where the hand has moved it to: of the rest
+#: nothing is known, and that of which it is a part, or which a hand took with it, has turned with it otherwise.
+_PART_WITHIN = 0.5
 
 
 async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
@@ -74,7 +77,9 @@ def _judge_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]
     before, target = cluster_of(grasp.sighting), placed.target
     T_base_now = grasp.motion_to(target)
     known, nearest = object_points(grasp.sighting.clouds[-1:]), (nearest_to((one,), target.position) for one in frames)
-    more = _was_next_to_others(grasp) and any(is_more(seen, known, T_base_now, run.config.held) for _, seen in nearest)
+    more = _was_next_to_others(grasp) and any(
+        is_more(seen, known, T_base_now, run.config.held.moved) for _, seen in nearest
+    )
     judge = _seen_in_part if before.cut or more else _seen_whole
     newest = CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
     for age, frame in enumerate(reversed(frames)):
@@ -120,7 +125,7 @@ def _seen_whole(
     expected = se3.apply(T_base_now, before.centroid)[:2]
     if now is not None and not leaned and float(np.linalg.norm(points[:, :2].mean(axis=0) - expected)) <= tolerance:
         return rested
-    return judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
+    return judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, _PART_WITHIN * config.held.moved)
 
 
 def _seen_in_part(
@@ -129,7 +134,8 @@ def _seen_in_part(
     """Judge by one image what was seen in part before; where no place was asked for, it is where it is seen."""
     config, request, place = run.config, run.request, target.position
     now, points = nearest_to((frame,), se3.apply(T_base_now, before.centroid))
-    seen = judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, config.held)
+    known = object_points(grasp.sighting.clouds[-1:])
+    seen = judge_moved(known, T_base_now, points, _PART_WITHIN * config.held.moved)
     if not seen.ok:
         return seen
     if now is None or not now.measured:

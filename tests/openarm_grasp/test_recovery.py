@@ -353,6 +353,19 @@ def test_what_meets_something_just_above_its_place_is_let_go_there(world, above,
 
 
 @pytest.mark.requirement("R-17")
+@pytest.mark.parametrize("times", [1, 2])
+def test_what_a_hand_kept_and_meets_something_with_goes_to_another_place(world, times):
+    assert world.grasp(phase="pick").success
+    world.fail(world.follows_path("carry"), Code.EXECUTION_FAILED, times=times)
+    outcome = world.grasp(phase="place")
+    first, second = world.done(PlanPlace)[-2:]
+    apart = first.targets[0].position - second.targets[0].position
+    assert np.linalg.norm(apart[:2]) > 0.02
+    assert outcome.success == (times == 1), outcome.message
+    assert list(world.session.kept) == ([] if times == 1 else ["right"])
+
+
+@pytest.mark.requirement("R-17")
 def test_what_a_hand_kept_is_let_go_where_it_meets_something_and_taken_from_there(world):
     """It hangs lower than it should, and would block the hand for every order to come."""
     assert world.grasp(phase="pick").success

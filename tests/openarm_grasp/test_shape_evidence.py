@@ -222,8 +222,8 @@ def test_what_was_seen_in_part_must_be_seen_where_the_hand_has_moved_it(off, cod
     part = part[part[:, 0] < 0.27]  # the other half was hidden
     T = se3.make(se3.rot_z(0.7), (0.1, 0.3, 0.0))
     now = slab(0.27 + off, -0.2) @ T[:3, :3].T + T[:3, 3]
-    assert judge_moved(part, T, now, HELD).code is code
-    assert judge_moved(part, T, np.empty((0, 3)), HELD).code is Code.PLACE_FAILED
+    assert judge_moved(part, T, now, HELD.moved).code is code
+    assert judge_moved(part, T, np.empty((0, 3)), HELD.moved).code is Code.PLACE_FAILED
 
 
 @pytest.mark.parametrize(("hidden", "more"), [(0.0, False), (0.01, False), (0.05, True)])
@@ -231,7 +231,7 @@ def test_what_is_larger_at_its_place_was_seen_in_part(hidden, more):
     part = slab(0.27, -0.2)
     part = part[part[:, 0] < 0.32 - hidden]
     T = se3.make(se3.rot_z(0.7), (0.1, 0.3, 0.0))
-    assert is_more(slab(0.27, -0.2) @ T[:3, :3].T + T[:3, 3], part, T, HELD) is more
+    assert is_more(slab(0.27, -0.2) @ T[:3, :3].T + T[:3, 3], part, T, HELD.moved) is more
 
 
 def test_what_came_next_to_a_placed_thing_may_be_a_part_of_it():
