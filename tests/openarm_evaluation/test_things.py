@@ -20,7 +20,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
 from openarm_evaluation.campaign import report
 from openarm_evaluation.campaign.options import CampaignOptions
-from openarm_evaluation.campaign.tasks import things
+from openarm_evaluation.campaign.tasks import settle, things
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.things import REFUSED, object_sources
 from openarm_evaluation.campaign.trial import crashed_row
@@ -132,6 +132,14 @@ def test_a_heap_lies_at_rest_on_the_table_and_all_of_it_is_requested(monkeypatch
         lowest.append(points[:, 2].min() - TOP)
     assert min(lowest) > -0.002
     assert min(lowest) < 0.002
+
+
+@pytest.mark.parametrize(("apart", "staying"), [(0.1, 2), (0.02, 0)])
+def test_things_that_were_driven_into_each_other_are_no_heap(monkeypatch, apart: float, staying: int) -> None:
+    for name, value in {"_FIRST": 0.045, "_NEXT": apart, "_FALL": 0.0, "_LIE": 0.0}.items():
+        monkeypatch.setattr(settle, name, value)
+    found = settle.dropped(("ball", "ball"), robot_work().table, (0.3, 0.0), 1e-3, np.random.default_rng(0))
+    assert len(found) == staying
 
 
 def test_a_heap_whose_objects_roll_off_the_table_is_refused(monkeypatch) -> None:

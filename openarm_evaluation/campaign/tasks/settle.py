@@ -23,6 +23,9 @@ _FIRST, _NEXT = 0.10, 0.10
 _FALL, _LIE, _STILL = 5.0, 6.0, 0.5
 #: m/s or rad/s.
 _SLOW = 0.005
+#: What lies on or against another thing is this deep in it at most, m. What falls on a thin thing may pass into it, and
+#: is driven about by both for as long as it is there.
+_DEEPEST = 0.001
 _WALL = 0.01
 
 
@@ -39,7 +42,7 @@ def dropped(
         rng: Turns them.
 
     Returns:
-        Those that came to rest on the table, in the order of `sources`.
+        Those that came to rest on the table, in the order of `sources`; none, when one of them is driven into another.
     """
     items: list[SceneObject] = []
     for k, source in enumerate(sources):
@@ -47,9 +50,10 @@ def dropped(
         p = np.array(centre) + rng.uniform(-0.3, 0.3, 2) * half
         height = table.top_z + _FIRST + _NEXT * k
         items.append(_item(f"thing_{k}", source, q / np.linalg.norm(q), (*p, height)))
-    items = _settled(items, table, _FALL, (*centre, half))
-    items = _settled(items, table, _LIE)
-    return [item for item in items if _on(item, table)]
+    items, _ = _settled(items, table, _FALL, (*centre, half))
+    items, jammed = _settled(items, table, _LIE)
+    staying = [item for item in items if _on(item, table)]
+    return [] if any(pair <= {item.name for item in staying} for pair in jammed) else staying
 
 
 def _item(name: str, source: str, q_xyzw: Array, position: Sequence[float]) -> SceneObject:
@@ -67,8 +71,8 @@ def _on(item: SceneObject, table: Table) -> bool:
 
 def _settled(
     items: Sequence[SceneObject], table: Table, seconds: float, walls: tuple[float, float, float] | None = None
-) -> list[SceneObject]:
-    """Return the objects as they lie when all are at rest, or after some time."""
+) -> tuple[list[SceneObject], list[set[str]]]:
+    """Return the objects as they lie when all are at rest, or after some time, and which are driven into each other."""
     spec, physics = mujoco.MjSpec(), PhysicsConfig()
     set_options(spec, physics)
     contact: dict[str, Any] = {
@@ -88,7 +92,9 @@ def _settled(
     while data.time < seconds and still < _STILL:
         mujoco.mj_step(model, data, nstep=50)
         still = still + 50 * model.opt.timestep if np.abs(data.qvel).max() < _SLOW else 0.0
-    mujoco.mj_kinematics(model, data)
+    mujoco.mj_forward(model, data)
+    deep = np.flatnonzero(data.contact.dist < -_DEEPEST)
+    jammed = [{model.body(model.geom_bodyid[geom]).name for geom in data.contact.geom[k]} for k in deep]
     out: list[SceneObject] = []
     for item in items:
         body, posed = data.body(item.name), item.posed
@@ -96,7 +102,7 @@ def _settled(
         points = se3.apply(T, posed.model.points)
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         out.append(_item(item.name, item.object, se3.quat_xyzw_from_matrix(T[:3, :3]), middle))
-    return out
+    return out, jammed
 
 
 def _add_walls(spec: mujoco.MjSpec, table: Table, walls: tuple[float, float, float]) -> None:

@@ -92,7 +92,7 @@ def objects_task(seed: int, objects: str = "") -> Task:
 def heap_task(seed: int, objects: str = "") -> Task:
     """Make a task with five to ten objects that were dropped together, all of them requested; as `objects_task`.
 
-    Where too many have rolled off the table, others are dropped.
+    Where too many have rolled off the table, or one was driven into another, others are dropped.
     """
     sources, rng = object_sources(objects), np.random.default_rng([seed, 43])
     work, items = robot_work(), list[SceneObject]()
@@ -103,8 +103,10 @@ def heap_task(seed: int, objects: str = "") -> Task:
         if len(items) >= _HEAP[0]:
             break
     else:
-        text = f"heap {seed}: fewer than {_HEAP[0]} objects stay on the table in each of {_DROPS} drops"
-        text += "; expected --objects that come to rest where they fall"
+        text = (
+            f"heap {seed}: fewer than {_HEAP[0]} objects stay on the table in each of {_DROPS} drops, or one is driven"
+        )
+        text += " into another; expected --objects that come to rest where they fall"
         raise OpenArmError(Code.INVALID_ARGUMENT, text)
     # what lies in a heap overlaps, seen from above: the scene is one of physics, and not checked as one of a file
     scene = Scene(name=f"heap_{seed}", objects=tuple(items), appearance=seed)
