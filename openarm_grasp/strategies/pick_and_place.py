@@ -348,11 +348,11 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
             if error.code is Code.GRASP_LOST:
                 raise
             if run.kept is not None or failure is not None:
-                if met or error.code is not Code.EXECUTION_FAILED:
-                    if grasp.turned or error.code not in NO_WAY:
-                        raise ObjectKeptError(Code.PLACE_FAILED, still_held(run, error)) from error
-                else:  # what it has met on the way there it may not meet on the way to another spot
+                if error.code is Code.EXECUTION_FAILED and not met:
+                    # what it has met on the way there it may not meet on the way to another spot
                     met, ways = True, other_spots(ways, run.used_places)
+                elif grasp.turned or error.code not in NO_WAY:
+                    raise ObjectKeptError(Code.PLACE_FAILED, still_held(run, error)) from error
                 # with its hand in the way, or other things: it may hang otherwise than is known
                 grasp, why = replace(grasp, turned=True), f"{error.message}; as what has turned in the hand"
                 continue
