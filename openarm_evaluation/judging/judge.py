@@ -185,7 +185,7 @@ def rests(track: Sequence[Sample], rules: JudgeConfig = RULES) -> bool:
 def _motion_at_end(track: Sequence[Sample], rules: JudgeConfig) -> tuple[float, float]:
     """Return how far from its last pose an object was in the rest time at the end: m and rad."""
     last = track[-1]
-    end = [sample for sample in track if last.t_ns - sample.t_ns <= rules.rest * 1e9]
+    end = list(itertools.takewhile(lambda sample: last.t_ns - sample.t_ns <= rules.rest * 1e9, reversed(track)))
     moved = max(float(np.linalg.norm(sample.p_world - last.p_world)) for sample in end)
     R_last = se3.matrix_from_quat_xyzw(last.q_xyzw)
     return moved, max(se3.angle_between(se3.matrix_from_quat_xyzw(sample.q_xyzw), R_last) for sample in end)

@@ -109,6 +109,12 @@ def _gone_with_it(grasp: Grasp, frames: Sequence[Frame]) -> CameraVerdict | None
     return _unproven(text, final=True)
 
 
+def _judge_known(run: Run, grasp: Grasp, T_base_now: Array, points: Array) -> CameraVerdict:
+    """Judge whether what was seen of it before is seen (n, 3) where the hand has moved it."""
+    known, tolerance = object_points(grasp.sighting.clouds[-1:]), _PART_WITHIN * run.config.held.moved
+    return judge_moved(known, T_base_now, points, tolerance)
+
+
 def _seen_whole(
     frame: Frame, run: Run, grasp: Grasp, target: PlaceTarget, before: Cluster, T_base_now: Array
 ) -> CameraVerdict:
@@ -125,7 +131,7 @@ def _seen_whole(
     expected = se3.apply(T_base_now, before.centroid)[:2]
     if now is not None and not leaned and float(np.linalg.norm(points[:, :2].mean(axis=0) - expected)) <= tolerance:
         return rested
-    return judge_moved(object_points(grasp.sighting.clouds[-1:]), T_base_now, points, _PART_WITHIN * config.held.moved)
+    return _judge_known(run, grasp, T_base_now, points)
 
 
 def _seen_in_part(
@@ -134,8 +140,7 @@ def _seen_in_part(
     """Judge by one image what was seen in part before; where no place was asked for, it is where it is seen."""
     config, request, place = run.config, run.request, target.position
     now, points = nearest_to((frame,), se3.apply(T_base_now, before.centroid))
-    known = object_points(grasp.sighting.clouds[-1:])
-    seen = judge_moved(known, T_base_now, points, _PART_WITHIN * config.held.moved)
+    seen = _judge_known(run, grasp, T_base_now, points)
     if not seen.ok:
         return seen
     if now is None or not now.measured:

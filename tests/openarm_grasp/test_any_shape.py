@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -174,6 +175,19 @@ def test_what_is_seen_away_from_its_target_is_not_said_to_be_placed() -> None:
     outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
     assert outcome.attempts == 2, outcome.message
     assert any("mm from its target, expected at most 15 mm" in step.reason for step in trials.steps)
+
+
+def test_what_was_seen_in_part_must_be_seen_within_half_of_what_counts_as_moved() -> None:
+    trials, arm = kept_banana()
+    kept = trials.session.kept[arm]
+    part = replace(kept.sighting, target=replace(kept.sighting.target, measured=False))
+    shifted = se3.make(p=(0.0, 0.014, 0.0)) @ kept.candidate.T_base_tcp
+    trials.session.kept[arm] = replace(kept, sighting=part, candidate=replace(kept.candidate, T_base_tcp=shifted))
+    trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    reasons = " ".join(step.reason for step in trials.steps)
+    off = re.search(r"what was seen of it is (\d+) mm from where it was put down, expected at most 6 mm", reasons)
+    assert off is not None
+    assert int(off[1]) <= 12
 
 
 def test_what_has_gone_with_what_a_hand_keeps_may_be_a_part_of_it() -> None:

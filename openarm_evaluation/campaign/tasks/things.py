@@ -103,10 +103,8 @@ def heap_task(seed: int, objects: str = "") -> Task:
         if len(items) >= _HEAP[0]:
             break
     else:
-        text = (
-            f"heap {seed}: fewer than {_HEAP[0]} objects stay on the table in each of {_DROPS} drops, or one is driven"
-        )
-        text += " into another; expected --objects that come to rest where they fall"
+        text = f"heap {seed}: fewer than {_HEAP[0]} objects stay on the table in each of {_DROPS} drops"
+        text += ", or one is driven into another; expected --objects that come to rest where they fall"
         raise OpenArmError(Code.INVALID_ARGUMENT, text)
     # what lies in a heap overlaps, seen from above: the scene is one of physics, and not checked as one of a file
     scene = Scene(name=f"heap_{seed}", objects=tuple(items), appearance=seed)
