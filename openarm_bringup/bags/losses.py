@@ -32,7 +32,7 @@ class Arrivals:
             free = publishers() - len(self._last)
             if free > 0 or not earlier:  # a new publisher, or in the place of one that has ended
                 if free <= 0:
-                    self._last.pop(0)
+                    del self._last[:1]
                 self._last.append(sequence)
                 return 0
             before = max(earlier)

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from unique_identifier_msgs.msg import UUID
 
 from openarm_common.robot.holds import KEY_BYTES, LEASE, ArmHolds
-from openarm_common.ros.node import BaseNode, reliable
+from openarm_common.ros.node import BaseNode, reliable, until_shutdown
 
 #: Where holds are announced: `hardware_id` is the key, hexadecimal; `name` the holder; the keys of `values` the arms.
 TOPIC = "/arm_holds"
@@ -33,6 +33,7 @@ class Holder:
 
     def __init__(self, node: BaseNode[Any]) -> None:
         self._key = os.urandom(KEY_BYTES)
+        self._context = node.context
         self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, reliable(_DEPTH))
         self._arms: list[str] = []
         #: What others read when they are refused.
@@ -59,7 +60,8 @@ class Holder:
 
     def _publish(self) -> None:
         values = [KeyValue(key=arm) for arm in self._arms]
-        self._publisher.publish(DiagnosticStatus(name=self.name, hardware_id=self._key.hex(), values=values))
+        with until_shutdown(self._context):
+            self._publisher.publish(DiagnosticStatus(name=self.name, hardware_id=self._key.hex(), values=values))
 
 
 class HoldListener:

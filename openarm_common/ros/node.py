@@ -92,7 +92,7 @@ def offered_qos(node: Node, topic: str, depth: int) -> QoSProfile:
 
 @contextmanager
 def until_shutdown(context: Context) -> Iterator[None]:
-    """Let publishing in a thread fail when a signal has shut the context down in the meantime."""
+    """Let publishing fail when a signal has shut the context down in the meantime."""
     try:
         yield
     except RCLError:

@@ -167,6 +167,21 @@ def test_a_signal_lets_the_node_bring_to_rest_what_it_moves_while_the_graph_is_t
         assert (process.returncode, out) == (0, "held True\nclosed\n")
 
 
+def test_a_signal_ends_a_node_that_holds_an_arm_with_exit_code_0() -> None:
+    """Its context is gone when it lets go."""
+    holds = "from openarm_common.ros.holds import Holder; self.holder = Holder(self); self.holder.hold('left')"
+    script = _SCRIPT.replace('print("ready", flush=True)', f"{holds}; print('ready', flush=True)").replace(
+        "super().close()", "self.holder.release(); super().close()"
+    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": os.environ}
+    with subprocess.Popen([sys.executable, "-c", script], **pipes) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        out, error = process.communicate(timeout=10.0)
+        assert (process.returncode, out) == (0, "closed\n"), error
+
+
 def test_an_end_that_takes_too_long_is_located_by_a_second_signal() -> None:
     hangs = "print('closing', flush=True); import threading; threading.Event().wait()"
     script = _SCRIPT.replace("super().close()", hangs)

@@ -53,3 +53,7 @@ def test_a_publisher_that_comes_later_is_no_loss() -> None:
     arrivals = Arrivals()
     assert [arrivals.missing(n, lambda: 1) for n in (1, 2)] == [0, 0]
     assert [arrivals.missing(n, lambda: 2) for n in (900, 3, 901)] == [0, 0, 0]
+
+
+def test_the_last_messages_of_a_publisher_that_has_gone_are_counted_too() -> None:
+    assert missing((500, 501, 503), 0) == 1
