@@ -18,6 +18,9 @@ from openarm_common.errors import Code, OpenArmError
 if TYPE_CHECKING:
     from openarm_bringup.supervision.supervisor import Supervisor
 
+#: A node without a sign of life for so long hangs, s; asked for with this period, s.
+_HANGS_S, _LOOK_S = 10.0, 2.0
+
 
 class Probe(Protocol):
     """Questions to the ROS graph; see `supervision.ros.readiness.ReadinessClient`."""
@@ -32,6 +35,10 @@ class Probe(Protocol):
 
     def parameters(self, node: str) -> frozenset[str]:
         """Return the names of a node's parameters."""
+        ...
+
+    def silence(self, node: str) -> float:
+        """Return for how long a node whose process lives has shown no sign of life, s."""
         ...
 
     def emergency_stop(self, seconds: float) -> str:
@@ -146,6 +153,7 @@ class Keeper:
         began = time.monotonic()
         ended = asyncio.create_task(process.wait())
         getting_ready = asyncio.create_task(self._get_ready(old))
+        tasks, why = [ended, getting_ready], ""
         try:
             await asyncio.wait(
                 {ended, getting_ready}, timeout=self.spec.ready_timeout, return_when=asyncio.FIRST_COMPLETED
@@ -161,10 +169,16 @@ class Keeper:
                 self.ready.set()
                 self._note_what_it_uses(process.pid)
                 self._enter(NodeState.READY, f"after {ready_at - began:.1f} s")
+                hanging = asyncio.create_task(self._until_it_hangs(process))
+                tasks.append(hanging)
+                await asyncio.wait({ended, hanging}, return_when=asyncio.FIRST_COMPLETED)
+                if not ended.done():
+                    why = hanging.result()
+                    process.kill()
             code = await ended
         finally:
-            getting_ready.cancel()
-            ended.cancel()
+            for task in tasks:
+                task.cancel()
         ready_s = time.monotonic() - ready_at if self.ready.is_set() else 0.0
         self.ready.clear()
         supervisor.tell_guard(f"-{process.pid}")
@@ -172,7 +186,7 @@ class Keeper:
             # It may not have taken leave of the others; its segments would take space that the next start needs.
             supervisor.ports.hold(self._ports)
             supervisor.say(await asyncio.to_thread(shm.clean_shm))
-        return code, f"ended by signal {-code}" if code < 0 else f"ended with code {code}", ready_s
+        return code, why or (f"ended by signal {-code}" if code < 0 else f"ended with code {code}"), ready_s
 
     async def _get_ready(self, old: frozenset[str]) -> None:
         conditions = self.spec.ready
@@ -182,6 +196,16 @@ class Keeper:
                 self._note_what_it_uses(self.process.pid)
         if conditions and self.spec.params and not self._was_ready:
             await self._check_parameters()
+
+    async def _until_it_hangs(self, process: NodeProcess) -> str:
+        """Wait until a process runs and its middleware shows no sign of life; return what to say of it."""
+        since, silence = time.monotonic(), 0.0
+        while min(silence, time.monotonic() - since) < _HANGS_S:
+            await asyncio.sleep(_LOOK_S)
+            silence = await self._supervisor.ask(lambda probe: probe.silence(self.name))
+            if process.stopped:
+                since = time.monotonic()
+        return f"hung: no sign of life for {silence:.0f} s"
 
     def _note_what_it_uses(self, pid: int) -> None:
         self.mapped |= shm.mapped_by(pid)

@@ -11,6 +11,8 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import psutil
+
 from openarm_bringup.supervision.guard import group_alive
 from openarm_bringup.supervision.log import LogFile
 from openarm_common.errors import Code, OpenArmError
@@ -80,6 +82,19 @@ class NodeProcess:
         """Exit code, minus the signal number, or None while it runs."""
         return self._process.returncode
 
+    @property
+    def stopped(self) -> bool:
+        """Whether somebody has halted it: with SIGSTOP, or in a debugger."""
+        try:
+            return psutil.Process(self.pid).status() in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP)
+        except psutil.NoSuchProcess:
+            return False
+
+    def kill(self) -> None:
+        """Kill it and what it has started."""
+        self.killed = True
+        self._signal(signal.SIGKILL)
+
     async def wait(self) -> int:
         """Wait for the end of the process and of everything it has started; return its exit code."""
         code = await self._process.wait()
@@ -96,8 +111,7 @@ class NodeProcess:
             self._signal(number)
             if await self._ended_within(grace, ladder.hurried):
                 return await self.wait()
-        self.killed = True
-        self._signal(signal.SIGKILL)
+        self.kill()
         return await self.wait()
 
     async def _ended_within(self, seconds: float, hurried: asyncio.Event) -> bool:
@@ -112,8 +126,7 @@ class NodeProcess:
         for _ in range(100):
             if not group_alive(self.pid):
                 return
-            self.killed = True
-            self._signal(signal.SIGKILL)
+            self.kill()
             await asyncio.sleep(0.02)
 
     def _signal(self, number: int) -> None:

@@ -151,10 +151,12 @@ def test_a_server_that_halts_for_a_while_is_not_dead_and_one_that_is_killed_then
         for halts in range(2):
             server.send_signal(signal.SIGSTOP)
             ros.spin_until(lambda: watched.alive == 0, 10.0, "silence")
+            assert watched.silence > 0.0
             assert not work.done()
             if not halts:
                 server.send_signal(signal.SIGCONT)
                 ros.spin_until(lambda: watched.alive == 1, 10.0, "a sign of life again")
+                assert watched.silence == 0.0
         began = killed(server, signal.SIGKILL)
         with pytest.raises(OpenArmError, match=r"/wait: the .* is gone"):
             work.result(20.0)

@@ -19,7 +19,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from openarm_bringup.supervision import environment, runs
+from openarm_bringup.supervision import environment, keeper, runs
 from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready, Restart
 from openarm_bringup.supervision.keeper import NodeState
 from openarm_bringup.supervision.process import Ladder
@@ -35,6 +35,8 @@ class FileProbe:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        #: What it says of every node, and how often it was asked for that.
+        self.silent_s, self.asked = 0.0, 0
 
     def _who(self, condition: Ready) -> str:
         path = self.folder / condition.name.strip("/")
@@ -48,6 +50,10 @@ class FileProbe:
 
     def parameters(self, node: str) -> frozenset[str]:
         return frozenset({"speed"})
+
+    def silence(self, node: str) -> float:
+        self.asked += 1
+        return self.silent_s
 
     def emergency_stop(self, seconds: float) -> str:
         (self.folder / "held").touch()
@@ -97,8 +103,10 @@ class Running:
 
 
 @contextlib.asynccontextmanager
-async def running(folder: Path, nodes: dict[str, NodeSpec], ladder: Ladder | None = None) -> AsyncIterator[Running]:
-    run = Running(folder, nodes, ladder)
+async def running(
+    folder: Path, nodes: dict[str, NodeSpec], ladder: Ladder | None = None, probe: FileProbe | None = None
+) -> AsyncIterator[Running]:
+    run = Running(folder, nodes, ladder, probe)
     await run.supervisor.start()
     try:
         yield run
@@ -251,6 +259,33 @@ time.sleep(60)
             assert int(port.read_text()) != first
         with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as one:
             one.bind(("", first))  # released at the end
+
+    asyncio.run(body())
+
+
+def test_a_node_that_hangs_is_started_again_and_one_that_somebody_has_halted_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keeper, "_HANGS_S", 0.1)
+    monkeypatch.setattr(keeper, "_LOOK_S", 0.01)
+    probe = FileProbe(tmp_path)
+
+    async def body() -> None:
+        async with running(tmp_path, {"toy": toy(tmp_path, "toy")}, probe=probe) as run:
+            await run.supervisor.wait_ready()
+            pid = run.supervisor.pid("toy")
+            os.kill(pid, signal.SIGSTOP)
+            probe.silent_s, asked = 20.0, probe.asked
+            await run.until(lambda: probe.asked > asked + 50)
+            assert run.seen("toy")[-1] is NodeState.READY
+            assert run.supervisor.pid("toy") == pid
+
+            os.kill(pid, signal.SIGCONT)
+            await run.until(lambda: NodeState.BACKOFF in run.seen("toy"))
+            probe.silent_s = 0.0
+            assert run.events[-1].detail.startswith("hung: no sign of life for 20 s; restart 1 of 5")
+            await run.until(lambda: run.supervisor.states()["toy"] is NodeState.READY)
+            assert gone(pid)
 
     asyncio.run(body())
 

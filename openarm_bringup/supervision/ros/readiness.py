@@ -14,11 +14,13 @@ from collections.abc import Mapping, Sequence
 from rcl_interfaces.srv import ListParameters
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from std_msgs.msg import Empty
 from std_srvs.srv import Trigger
 
 from openarm_bringup.messages import interface
 from openarm_bringup.supervision.graph import Ready
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.actions import RCLError, Watch, alive_topic
 from openarm_common.ros.client import ContextNode
 
 #: Time that a service gets to answer before it is asked again, s.
@@ -37,6 +39,7 @@ class ReadinessClient(ContextNode):
         super().__init__(f"openarm_probe_{os.getpid()}", domain=int(environ["ROS_DOMAIN_ID"]))
         self._waiting: dict[str, Subscription] = {}
         self._received: set[str] = set()
+        self._watches: dict[str, Watch] = {}
         self._stop = self._node.create_client(Trigger, "/stop")
 
     def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
@@ -48,9 +51,21 @@ class ReadinessClient(ContextNode):
 
     def unmet(self, conditions: Sequence[Ready], old: frozenset[str]) -> tuple[str, ...]:
         """Return the conditions that do not hold yet, not counting endpoints in `old`."""
-        for _ in range(4):
-            self._executor.spin_once(timeout_sec=0.0)
+        self._spin()
         return tuple(str(condition) for condition in conditions if not self._met(condition, old))
+
+    def silence(self, node: str) -> float:
+        """Return for how long a node whose process lives has shown no sign of life, s; 0 while it does.
+
+        Its middleware shows that it lives: a node that computes for long does not become silent.
+        """
+        try:
+            if node not in self._watches:
+                self._watches[node] = Watch(self._node, Empty, alive_topic(f"/{node}"), node)
+            self._spin()
+        except RCLError:  # there is no memory, say: nothing is known of it
+            return 0.0
+        return self._watches[node].silence
 
     def parameters(self, node: str, timeout_s: float = 20.0) -> frozenset[str]:
         """Return the names of a node's parameters.
@@ -79,6 +94,10 @@ class ReadinessClient(ContextNode):
         if not self.spin_until(answer.done, seconds):
             return f"/stop did not answer within {seconds:g} s"
         return str(answer.result().message)
+
+    def _spin(self) -> None:
+        for _ in range(4):
+            self._executor.spin_once(timeout_sec=0.0)
 
     def _met(self, condition: Ready, old: frozenset[str]) -> bool:
         if condition.kind == "message":
