@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 from control_msgs.action import FollowJointTrajectory
 from std_srvs.srv import Trigger
 
+from openarm_bringup.supervision.ros.readiness import ReadinessClient
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import ActionClient
@@ -161,6 +163,28 @@ def test_a_server_that_halts_for_a_while_is_not_dead_and_one_that_is_killed_then
         with pytest.raises(OpenArmError, match=r"/wait: the .* is gone"):
             work.result(20.0)
         assert time.monotonic() - began < 2.0
+
+
+def test_the_probe_of_a_supervisor_knows_who_is_silent_and_when_it_is_deaf_itself(ros, children) -> None:
+    environ = {name: os.environ[name] for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
+    with ReadinessClient(environ) as probe:
+        one, two = (children.start(SERVICE.replace("waiter", name)) for name in ("one", "two"))
+
+        def silent() -> list[bool]:
+            return [probe.silence(name) > 0.0 for name in ("one", "two")]
+
+        def alive() -> list[int]:
+            silent()
+            return [probe._watches[name].alive for name in ("one", "two")]
+
+        ros.spin_until(lambda: alive() == [1, 1], 60.0, "two nodes that live")
+        one.send_signal(signal.SIGSTOP)
+        ros.spin_until(lambda: silent() == [True, False], 20.0, "the silence of the first")
+        two.send_signal(signal.SIGSTOP)
+        ros.spin_until(lambda: alive() == [0, 0], 20.0, "the silence of both")
+        assert silent() == [False, False]
+        one.send_signal(signal.SIGCONT)
+        ros.spin_until(lambda: silent() == [False, True], 20.0, "the silence of the second")
 
 
 @pytest.mark.requirement("R-21")

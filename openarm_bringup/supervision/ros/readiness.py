@@ -57,7 +57,8 @@ class ReadinessClient(ContextNode):
     def silence(self, node: str) -> float:
         """Return for how long a node whose process lives has shown no sign of life, s; 0 while it does.
 
-        Its middleware shows that it lives: a node that computes for long does not become silent.
+        Its middleware shows that it lives: a node that computes for long does not become silent. When all are silent,
+        it is this probe that hears nothing: 0.
         """
         try:
             if node not in self._watches:
@@ -65,7 +66,8 @@ class ReadinessClient(ContextNode):
             self._spin()
         except RCLError:  # there is no memory, say: nothing is known of it
             return 0.0
-        return self._watches[node].silence
+        silences = [watch.silence for watch in self._watches.values() if watch.alive or watch.silence]
+        return 0.0 if all(silences) else self._watches[node].silence
 
     def parameters(self, node: str, timeout_s: float = 20.0) -> frozenset[str]:
         """Return the names of a node's parameters.
