@@ -54,9 +54,9 @@ def up(start_graph: Any) -> Any:
     return graph
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def visitor(up: Any) -> Iterator[Node]:
-    """A node that looks at the graph, spun by tests."""
+    """A node that looks at the graph, spun by tests; when nodes leave, Fast DDS may hold who stays (Fast-DDS#6502)."""
     rclpy.init(domain_id=up.domain)
     node = rclpy.create_node("visitor")
     try:
