@@ -40,6 +40,10 @@ hypothesis.settings.register_profile("explore", deadline=None)
 hypothesis.settings.load_profile("suite")
 
 
+#: What a wait for nodes and processes takes at most, s; far above what it takes on a slow and busy machine.
+DEADLINE_S = 30.0
+
+
 class MachineLock:
     """Keeps a test that is marked `alone` from running at the same time as tests of other worker processes.
 
@@ -86,7 +90,24 @@ def pytest_configure(config: pytest.Config) -> None:
         config.stash[_LOCK] = MachineLock(config.cache.mkdir("lock"))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all", action="store_true", help="run the tests that are marked `long`, too")
+    parser.addoption(
+        "--record", action="store_true", help="simulate what tests replay, and write it anew; no other test"
+    )
+
+
+def _wanted(item: pytest.Item) -> bool:
+    if item.config.getoption("record"):
+        return "recorded" in getattr(item, "fixturenames", ()) and "simulated" in item.name
+    named = any("::" in argument for argument in item.config.args)  # a test that is asked for by its name is run
+    return named or item.config.getoption("all") or item.get_closest_marker("long") is None
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    wanted = [_wanted(item) for item in items]
+    config.hook.pytest_deselected(items=[item for item, keep in zip(items, wanted, strict=True) if not keep])
+    items[:] = [item for item, keep in zip(items, wanted, strict=True) if keep]
     items.sort(key=_alone)  # last: until then no worker waits
 
 
@@ -105,17 +126,12 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 
 class RosProbe:
-    """An executor with nodes in it, driven by conditions."""
+    """An executor with nodes in it, driven by conditions; deadlines are in seconds of the wall clock."""
 
     def __init__(self) -> None:
-        import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
 
-        # A domain for each test: what an earlier one left behind in this process is not met.
-        self._domain, self._before = reserve_domain(), os.environ["ROS_DOMAIN_ID"]
-        os.environ["ROS_DOMAIN_ID"] = str(self._domain)
-        rclpy.init()
         self.executor = SingleThreadedExecutor()
         self.nodes: list[Node] = []
         #: A node to make publishers, subscriptions and clients of the test with.
@@ -128,7 +144,7 @@ class RosProbe:
         self.nodes.append(node)
         return node
 
-    def spin_until(self, condition: Callable[[], object], timeout: float = 10.0, what: str = "") -> None:
+    def spin_until(self, condition: Callable[[], object], timeout: float = DEADLINE_S, what: str = "") -> None:
         """Spin until `condition` holds; fail with `what` after `timeout` seconds."""
         deadline = time.monotonic() + timeout
         while not condition():
@@ -136,23 +152,23 @@ class RosProbe:
                 pytest.fail(f"not within {timeout:g} s: {what or 'the condition'}")
             self.executor.spin_once(timeout_sec=0.05)
 
-    def result(self, future, timeout: float = 10.0, what: str = "the answer"):
+    def result(self, future, timeout: float = DEADLINE_S, what: str = "the answer"):
         """Spin until a future is done and return its result."""
         self.spin_until(future.done, timeout, what)
         return future.result()
 
-    def call(self, client, request, timeout: float = 10.0):
+    def call(self, client, request, timeout: float = DEADLINE_S):
         """Call a service and return its answer."""
         self.spin_until(client.service_is_ready, timeout, f"service {client.srv_name} is there")
         return self.result(client.call_async(request), timeout, f"an answer of {client.srv_name}")
 
-    def send_goal(self, client, goal, timeout: float = 10.0, **kwargs):
+    def send_goal(self, client, goal, timeout: float = DEADLINE_S, **kwargs):
         """Send an action goal and return (goal handle, result future or, when it was rejected, None)."""
         self.spin_until(client.server_is_ready, timeout, "the action server is there")
         handle = self.result(client.send_goal_async(goal, **kwargs), timeout, "goal answer")
         return handle, handle.get_result_async() if handle.accepted else None
 
-    def hear_all(self, client, goal, heard: list, last: Callable[[], object], timeout: float = 10.0):
+    def hear_all(self, client, goal, heard: list, last: Callable[[], object], timeout: float = DEADLINE_S):
         """Send a goal, put its feedback into `heard`, and return its result.
 
         That is asked for only when the `last` feedback has come: rclpy takes no more of it once it has the result.
@@ -163,22 +179,33 @@ class RosProbe:
         return self.result(self.result(sent).get_result_async(), timeout).result
 
     def close(self) -> None:
-        """Shut down in order."""
-        import rclpy
-
+        """Take the nodes down, the newest first."""
         self.executor.shutdown(timeout_sec=2.0)
         for node in reversed(self.nodes):
             if hasattr(node, "close"):
                 node.close()
             node.destroy_node()
+
+
+@pytest.fixture(scope="module")
+def ros_domain() -> Iterator[int]:
+    """The context of a module in a ROS domain of its own: what other modules left in this process is not met."""
+    import rclpy
+
+    domain, before = reserve_domain(), os.environ["ROS_DOMAIN_ID"]
+    os.environ["ROS_DOMAIN_ID"] = str(domain)
+    rclpy.init()
+    try:
+        yield domain
+    finally:
         rclpy.try_shutdown()
-        release_domain(self._domain)
-        os.environ["ROS_DOMAIN_ID"] = self._before  # another process may reserve the released one
+        release_domain(domain)
+        os.environ["ROS_DOMAIN_ID"] = before  # another process may reserve the released one
 
 
 @pytest.fixture
-def ros() -> Iterator[RosProbe]:
-    """A ROS context, an executor and a probe node for one test."""
+def ros(ros_domain: int) -> Iterator[RosProbe]:
+    """An executor and a probe node for one test, in the domain of its module."""
     probe = RosProbe()
     try:
         yield probe

@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -48,7 +49,7 @@ case "$1 $2" in
     mkdir -p "$out"
     touch "$out/made.whl"
     ;;
-"pip sync") [ -z "${SLOW-}" ] || { touch "$SLOW"; sleep 5; } ;;
+"pip sync") [ -z "${SLOW-}" ] || { touch "$SLOW"; while [ -e "$SLOW" ]; do sleep 0.05; done; } ;;
 esac
 """
 
@@ -95,7 +96,7 @@ class Machine:
             env=self.env | env,
             text=True,
             capture_output=True,
-            timeout=30,
+            timeout=120,
             cwd="/",
         )
 
@@ -134,12 +135,9 @@ def test_set_up_hands_over_its_arguments_and_the_next_run_does_nothing(machine: 
     assert any("pip sync" in call and "--require-hashes" in call for call in calls)
     assert list(machine.cache.glob("openarm/tmp.*")) == []
 
-    started = time.monotonic()
     second = machine.run("a b", "c")
-    took = time.monotonic() - started
     assert (second.stdout, second.stderr) == ("args: a b c\nPYTHONPATH: unset\n", "")
     assert machine.uv_calls() == []
-    assert took < 2.0  # some 0.03 s on an idle machine
 
 
 def test_a_changed_message_rebuilds_its_package_only_and_a_second_clone_builds_nothing(machine: Machine) -> None:
@@ -181,12 +179,13 @@ def test_an_interrupted_set_up_leaves_no_stamp_and_the_next_recreates_the_enviro
     with subprocess.Popen(
         command, env=machine.env | {"SLOW": str(reached)}, start_new_session=True, preexec_fn=_interruptible
     ) as process:
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 60
         while not reached.exists():
             assert time.monotonic() < deadline, "set-up did not come to the packages"
-            time.sleep(0.02)
+            threading.Event().wait(0.02)
         os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(20) == 130
+        reached.unlink()
+        assert process.wait(60) == 130
     assert not (machine.root / ".venv" / ".openarm-setup").exists()
     assert list(machine.cache.glob("openarm/tmp.*")) == []
     machine.uv_calls()
@@ -202,21 +201,21 @@ def test_an_interrupted_set_up_ends_the_build_that_runs_beside(machine: Machine)
     with subprocess.Popen(
         command, env=machine.env | {"BUILDS": str(builds)}, start_new_session=True, preexec_fn=_interruptible
     ) as process:
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 60
         while len(pids := builds.read_text().split()) < 5:
             assert time.monotonic() < deadline, "the build did not begin"
-            time.sleep(0.02)
+            threading.Event().wait(0.02)
         os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(20) == 130
+        assert process.wait(60) == 130
     while any(Path(f"/proc/{pid}").exists() for pid in pids):
         assert time.monotonic() < deadline, "the build goes on"
-        time.sleep(0.02)
+        threading.Event().wait(0.02)
 
 
 def test_two_runs_at_once_set_up_once(machine: Machine) -> None:
     command = [machine.root / "openarm", "x"]
     both = [subprocess.Popen(command, env=machine.env, stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    assert [process.communicate(timeout=30)[0].splitlines()[0] for process in both] == ["args: x"] * 2
+    assert [process.communicate(timeout=120)[0].splitlines()[0] for process in both] == ["args: x"] * 2
     assert sum("requirements.lock" in call for call in machine.uv_calls()) == 1
 
 

@@ -16,3 +16,4 @@ lock requirements-dev.lock --group dev --constraints requirements.lock "$@"
 printf '%s\n' pymoveit2 trimesh | lock requirements-moveit.lock --constraints requirements.lock "$@" -
 echo foxglove-sdk | lock requirements-viz.lock --constraints requirements.lock "$@" -
 printf 'pyrealsense2\nlibusb-package\n' | lock requirements-realsense.lock --constraints requirements.lock "$@" -
+echo python-can | lock requirements-can.lock --constraints requirements.lock "$@" -

@@ -25,21 +25,25 @@ WORKERS = 2
 #: What pytest can't do, or shows less of, when tests run in other processes.
 NEEDS_ONE_PROCESS = ("-s", "--capture=no", "--pdb", "--trace", "--collect-only", "--co", "no:xdist")
 
+#: What a run ends with: the slowest tests, and each that was skipped with its reason.
+REPORT = ("--durations=25", "-rs")
+
 Rest = Annotated[str, Parameter(allow_leading_hyphen=True)]
 
 
-def test(*args: Rest) -> Outcome:
-    """Run the tests of cores, nodes and whole graphs.
+def test(*args: Rest, every: Annotated[bool, Parameter(name="--all", negative="")] = False) -> Outcome:  # noqa: PT028
+    """Run the tests of cores and nodes, and of a graph that grasps; print the slowest and what was skipped.
 
     Args:
-        args: Passed to pytest; without a path, all tests run, in two processes (-n 0: in one).
+        args: Passed to pytest; without a path, all files run, in two processes (-n 0: in one).
+        every: Run the long tests, too: faults, campaigns, other robots, replays, two hosts, whatever measures time.
     """
     root = _checkout()
     given_paths = [arg for arg in args if not arg.startswith("-") and (root / arg.partition("::")[0]).exists()]
     paths = [] if given_paths else _in_order(root / "tests")
     began = time.monotonic()
     shared = [] if given_paths or set(NEEDS_ONE_PROCESS) & set(args) else _shared_out()
-    command = [sys.executable, "-m", "pytest", "-q", *shared, *paths, *args]
+    command = [sys.executable, "-m", "pytest", "-q", *REPORT, *(["--all"] if every else []), *shared, *paths, *args]
     # Byte code is kept, whatever the environment says: the tests start a hundred processes.
     env = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     code = subprocess.run(command, cwd=root, env=env, check=False).returncode
@@ -96,11 +100,11 @@ def completion(shell: Literal["bash", "zsh", "fish"] = "bash", *, install: bool 
 def _in_order(tests: Path) -> list[str]:
     """Return the test files: those that wait evenly among those that compute, of each kind the longest first.
 
-    A long one that came last would keep one process busy and the others waiting. Those with a test that is marked slow
+    A long one that came last would keep one process busy and the others waiting. Those with a test that is marked long
     come first, then those with most text.
     """
     texts = {path: path.read_bytes() for path in tests.rglob("test_*.py")}
-    files = sorted(texts, key=lambda path: (b"mark.slow" not in texts[path], -len(texts[path]), path))
+    files = sorted(texts, key=lambda path: (b"mark.long" not in texts[path], -len(texts[path]), path))
     kinds = [path.relative_to(tests).parts[0] in WAITING for path in files]
     ranks = [kinds[:k].count(kind) / kinds.count(kind) for k, kind in enumerate(kinds)]
     return [str(path.relative_to(tests.parent)) for _, path in sorted(zip(ranks, files, strict=True))]

@@ -88,9 +88,28 @@ class SimulatedSenses(Config):
 
 
 @coroutine
-def _turn() -> Generator[None, None, None]:
+def turn() -> Generator[None, None, None]:
     """Give one control tick; for coroutines of this process."""
     yield
+
+
+async def together(parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
+    """Run coroutines concurrently, tick by tick, until all have ended; then raise the first error."""
+    left = [part().__await__() for part in parts]
+    faults: list[OpenArmError] = []
+    while left:
+        for work in list(left):
+            try:
+                next(work)
+            except StopIteration:
+                left.remove(work)
+            except OpenArmError as error:
+                left.remove(work)
+                faults.append(error)
+        if left:
+            await turn()
+    if faults:
+        raise faults[0]
 
 
 class SimRobot:
@@ -214,13 +233,13 @@ class SimRobot:
 
     async def pause(self) -> None:
         """Let one control tick pass."""
-        await _turn()
+        await turn()
 
     async def wait(self, seconds: float) -> None:
         """Let simulated time pass."""
         end_ns = self.t_ns + round(seconds * 1e9)
         while self.t_ns < end_ns:
-            await _turn()
+            await turn()
 
     async def compute(self, work: Callable[[], T], nominal: float = PLANNING_S) -> T:
         """Run work now; a constant time passes for the robot."""
@@ -232,23 +251,7 @@ class SimRobot:
                 self.planning_s.append(time.perf_counter() - began)
             await self.wait(nominal)
 
-    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
-        """Run coroutines concurrently, tick by tick, until all have ended."""
-        left = [part().__await__() for part in parts]
-        faults: list[OpenArmError] = []
-        while left:
-            for work in list(left):
-                try:
-                    next(work)
-                except StopIteration:
-                    left.remove(work)
-                except OpenArmError as error:
-                    left.remove(work)
-                    faults.append(error)
-            if left:
-                await _turn()
-        if faults:
-            raise faults[0]
+    together = staticmethod(together)
 
     def _take_held(self) -> None:
         held = self.motion.held_on_links().values()

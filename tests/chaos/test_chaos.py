@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.long
 @pytest.mark.alone
 @pytest.mark.requirement("P-34")
 def test_a_graph_under_faults_holds_what_must_never_happen(tmp_path: Path) -> None:

@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import re
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import rclpy
 from rclpy.action.graph import get_action_server_names_and_types_by_node
@@ -13,6 +16,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from openarm_bringup.supervision.graph import load_graph
 
+T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[2]
 INTERFACES = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
 ROW = re.compile(r"^\| `(/[^`]+)` \| `([^`]+/(?:msg|srv|action)/[^`]+)` \|(.*)\|$", re.MULTILINE)
@@ -38,12 +42,18 @@ STANDARD = (
 )
 
 
-def settled(node: Node) -> dict[str, list[str]]:
-    """Return topics and types, once every stated topic has every stated publisher (or 20 s later)."""
-    for _ in range(200):
-        if all(publishers(node, name) == stated for name, stated in stated_publishers().items()):
-            break
+def until(node: Node, look: Callable[[], T], good: Callable[[T], bool], seconds: float = 60.0) -> T:
+    """Spin until what is seen is good; return it, or what was seen last."""
+    deadline = time.monotonic() + seconds
+    while not good(seen := look()) and time.monotonic() < deadline:
         rclpy.spin_once(node, timeout_sec=0.1)
+    return seen
+
+
+def settled(node: Node) -> dict[str, list[str]]:
+    """Return topics and types, once every stated topic has every stated publisher."""
+    stated = stated_publishers()
+    until(node, lambda: {name: publishers(node, name) for name in stated}, lambda seen: seen == stated)
     return dict(node.get_topic_names_and_types())
 
 

@@ -17,7 +17,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import points_from_cloud
 from openarm_common.scene.scene import load_scene
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.graph, pytest.mark.long, pytest.mark.alone]
 
 
 @pytest.mark.requirement("A-77", "B-66")

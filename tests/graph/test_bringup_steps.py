@@ -24,7 +24,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from openarm_common.ros.actions import ActionClient
 from openarm_common.scene.scene import load_scene
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow]
+pytestmark = [pytest.mark.graph, pytest.mark.long]
 
 
 @contextmanager

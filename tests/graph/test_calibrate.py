@@ -16,7 +16,7 @@ from openarm_calibration.store.store import CalibrationStore
 from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.ros.client import BackgroundNode
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow]
+pytestmark = [pytest.mark.graph, pytest.mark.long]
 
 #: Of the mounts; the suite has no calibration of it.
 SEED = 3

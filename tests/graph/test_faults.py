@@ -22,7 +22,7 @@ from openarm_motion.ros.client import MotionClient
 from tests.graph.asking import Asked
 from tests.graph.control_log import ControlLog, hanging, last_move_ns
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.graph, pytest.mark.long, pytest.mark.alone]
 
 #: The deadline that /joint_states are offered with, s.
 DEADLINE = 0.2

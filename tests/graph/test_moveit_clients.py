@@ -16,7 +16,7 @@ from tests.graph.conftest import ROOT
 pytest.importorskip(
     "pymoveit2", reason="needs pymoveit2: .venv/bin/uv pip install --require-hashes -r requirements-moveit.lock"
 )
-pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.requirement("R-28")]
+pytestmark = [pytest.mark.graph, pytest.mark.long, pytest.mark.requirement("R-28")]
 
 #: Names of the library's own preset; of the robot's SRDF.
 _NAMES = {

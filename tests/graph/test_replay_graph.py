@@ -18,7 +18,7 @@ from vision_msgs.msg import Detection3DArray
 from openarm_bringup.bags import golden
 
 BAG = Path(__file__).parents[1] / "data" / "demo_pick"
-pytestmark = [pytest.mark.graph, pytest.mark.slow]
+pytestmark = [pytest.mark.graph, pytest.mark.long]
 
 
 def test_a_replayed_bag_is_detected_as_the_robot_was(start_graph: Any) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.graph, pytest.mark.long, pytest.mark.alone]
 
 ROOT = Path(__file__).parents[2]
 

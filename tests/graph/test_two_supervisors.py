@@ -20,7 +20,7 @@ from openarm_grasp.ros.client import GraspClient
 from openarm_motion.ros.client import MotionClient
 from tests.graph.asking import Asked
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.graph, pytest.mark.long, pytest.mark.alone]
 
 EYES = """
 extends: vision

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph split over two hosts gives the same grasp as on one. Two minutes, as root: OPENARM_TWO_MACHINES=1."""
+"""The graph split over two hosts gives the same grasp as on one."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.skipif(
-    os.geteuid() != 0 or shutil.which("ip") is None or not os.environ.get("OPENARM_TWO_MACHINES"),
-    reason="needs root, iproute2 and two minutes; set OPENARM_TWO_MACHINES=1",
-)
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("ip") is None, reason="needs root, and `ip` of iproute2")
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("mode", ["multicast", "server"])
 @pytest.mark.requirement("A-05")

@@ -48,7 +48,7 @@ class Bench:
         self.joints: list[JointState] = []
         self.joint_arrivals: list[float] = []
         ros.node.create_subscription(JointState, "/joint_states", self._on_joints, QOS_COMMAND)
-        ros.spin_until(lambda: self.joints, 10.0, "a joint state")
+        ros.spin_until(lambda: self.joints, what="a joint state")
 
     def _on_joints(self, message) -> None:
         self.joints.append(message)
@@ -64,7 +64,7 @@ class Bench:
         """The next n messages of a list that are later than what is on its way now."""
         self.spin_sim(0.1)
         had = len(got)
-        self.ros.spin_until(lambda: len(got) >= had + n, 20.0, f"{n} messages")
+        self.ros.spin_until(lambda: len(got) >= had + n, what=f"{n} messages")
         return got[had:]
 
     def position(self, name: str) -> float:
@@ -141,7 +141,7 @@ class Bench:
 
         handle, future = self.send_grip(JointState(name=[self.FINGER], position=[position]))
         assert handle.accepted
-        return self.ros.result(future, 15.0)
+        return self.ros.result(future)
 
     def tcp_pose(self) -> np.ndarray:
         """T_world_tcp, (4, 4), of the simulated arm now."""

@@ -100,7 +100,7 @@ class Bench:
         self.watch = Watch(ros, Detection3DArray, "/detections_3d")
         self.diagnostics = Watch(ros, DiagnosticArray, "/diagnostics")
         self.t_ns = 1_000 * MS
-        ros.spin_until(camera.watched, 10.0, "the detector listens to the camera")
+        ros.spin_until(camera.watched, what="the detector listens to the camera")
 
     def frame(self, **replace) -> None:
         self.t_ns += 200 * MS
@@ -121,7 +121,7 @@ class Bench:
                 self.frame(**{stream: message(t_ns) for stream, message in make.items()})
             return condition()
 
-        self.ros.spin_until(step, 10.0, what)
+        self.ros.spin_until(step, what=what)
 
     def detect(self, what: str = "a detection") -> Detection3DArray:
         """The answer to a frame that is newer than every one before."""

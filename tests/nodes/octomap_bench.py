@@ -102,7 +102,7 @@ class Bench:
                 )
             return bool(condition())
 
-        self.ros.spin_until(step, 20.0, what)
+        self.ros.spin_until(step, what=what)
 
     def state(self, point: tuple[float, float, float], message: Octomap | None = None) -> str:
         """What a map (the newest one) says of a point."""

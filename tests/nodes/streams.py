@@ -23,7 +23,7 @@ if __name__ == "__main__":
         assert time.monotonic() < deadline, "no subscriber"
         rclpy.spin_once(node, timeout_sec=0.05)
     last.publish(String())
-    print("met" if last.wait_for_all_acked(Duration(seconds=10)) else "not met", flush=True)  # noqa: T201
+    print("met" if last.wait_for_all_acked(Duration(seconds=60)) else "not met", flush=True)  # noqa: T201
     input()
     for k in range(ROUNDS):
         for stream in streams:
@@ -31,5 +31,5 @@ if __name__ == "__main__":
     print("sent", flush=True)  # noqa: T201
     input()
     last.publish(String())  # behind all of them in the queue
-    print("taken" if last.wait_for_all_acked(Duration(seconds=10)) else "not taken", flush=True)  # noqa: T201
+    print("taken" if last.wait_for_all_acked(Duration(seconds=60)) else "not taken", flush=True)  # noqa: T201
     input()

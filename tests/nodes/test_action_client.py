@@ -50,7 +50,7 @@ def asked(ros) -> Iterator[Callable[..., list[Any]]]:
                 for _ in wanted:
                     try:
                         goal = FollowJointTrajectory.Goal()
-                        answers.append(asking.do(FollowJointTrajectory, NAME, goal, timeout=10.0).error_string)
+                        answers.append(asking.do(FollowJointTrajectory, NAME, goal, timeout=60.0).error_string)
                     except OpenArmError as error:
                         answers.append(error.code)
 

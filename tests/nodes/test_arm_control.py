@@ -19,8 +19,6 @@ from openarm_common.ros.node import QOS_COMMAND
 from openarm_control.ros.node import ArmControl
 from tests.nodes.conftest import Bench
 
-pytestmark = pytest.mark.alone
-
 
 @pytest.fixture
 def robot(bridge) -> Bench:
@@ -32,12 +30,12 @@ def robot(bridge) -> Bench:
 def bench(robot: Bench) -> Bench:
     """And the node before it."""
     # in one process with the robot and this test, neither of them in real time: a robot that is late is off its path
-    patient = [Parameter("stale_after", value=2.0), Parameter("trajectory.path_tolerance", value=1.0)]
+    patient = [Parameter("stale_after", value=5.0), Parameter("trajectory.path_tolerance", value=1.0)]
     robot.ros.add(ArmControl(parameter_overrides=[Parameter("dynamics_seed", value=1), *patient]))
     robot.passed_on = robot.collect(JointState, "/arm_control/joint_states", QOS_COMMAND)
     name = "/arm_control/right_joint_trajectory_controller/controller_state"
     robot.states = robot.collect(JointTrajectoryControllerState, name, QOS_COMMAND)
-    robot.ros.spin_until(lambda: robot.states, 20.0, "the state of a controller")
+    robot.ros.spin_until(lambda: robot.states, what="the state of a controller")
     return robot
 
 
@@ -49,7 +47,7 @@ def move(bench: Bench, prefix: str, offset: float, seconds: float) -> FollowJoin
         bench.ros.node, FollowJointTrajectory, f"{prefix}/right_joint_trajectory_controller/follow_joint_trajectory"
     )
     _, result = bench.ros.send_goal(client, goal)
-    return bench.ros.result(result, 20.0).result
+    return bench.ros.result(result).result
 
 
 def errors(bench: Bench, since: int) -> np.ndarray:
@@ -61,12 +59,20 @@ def test_a_soft_arm_follows_a_motion_and_arrives(bench: Bench) -> None:
     since = len(bench.states)
     result = move(bench, "/arm_control", 0.6, 2.0)
     assert result.error_code == 0, result.error_string
-    assert np.quantile(errors(bench, since).max(axis=1), 0.75) < 0.1  # it is late at times where the machine is busy
     since = len(bench.states)
     bench.spin_sim(0.5)
     assert errors(bench, since).max() < 0.02
     at = dict(zip(bench.joints[-1].name, bench.joints[-1].position, strict=True))
     assert at["openarm_right_joint2"] == pytest.approx(bench.states[-1].reference.positions[1], abs=0.02)
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.requirement("R-03", "A-25")
+def test_a_soft_arm_is_near_to_its_path_all_the_way(bench: Bench) -> None:
+    since = len(bench.states)
+    assert move(bench, "/arm_control", 0.6, 2.0).error_code == 0
+    assert np.quantile(errors(bench, since).max(axis=1), 0.75) < 0.1  # it is late at times where the machine is busy
 
 
 @pytest.mark.requirement("R-03")
@@ -82,8 +88,18 @@ def test_the_same_motion_sent_to_the_robot_itself_is_a_blow(robot: Bench) -> Non
 
 
 @pytest.mark.requirement("R-03")
-def test_joint_states_come_at_each_physics_step_and_are_passed_on_at_the_rate_of_control(bench: Bench) -> None:
+def test_there_is_no_clock_no_velocity_of_a_finger_and_no_effort(bench: Bench) -> None:
     clocks = bench.collect(Clock, "/clock", qos_profile_sensor_data)
+    bench.spin_sim(1.0)
+    assert clocks == []
+    finger = bench.joints[-1].name.index(bench.FINGER)
+    assert all(message.velocity[finger] == message.effort[finger] == 0.0 for message in bench.joints)
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.requirement("R-03")
+def test_joint_states_come_at_each_physics_step_and_are_passed_on_at_the_rate_of_control(bench: Bench) -> None:
     had, since = len(bench.joints), len(bench.passed_on)
     bench.spin_sim(1.0)
     steps = np.diff([stamp_to_ns(message.header.stamp) for message in bench.joints[had:]])
@@ -91,9 +107,6 @@ def test_joint_states_come_at_each_physics_step_and_are_passed_on_at_the_rate_of
     assert np.any(steps == 2_000_000)
     assert np.mean(steps % 2_000_000 == 0) > 0.9
     assert 30 <= len(bench.passed_on) - since <= 110  # 100; fewer where the machine is busy
-    assert clocks == []
-    finger = bench.joints[-1].name.index(bench.FINGER)
-    assert all(message.velocity[finger] == message.effort[finger] == 0.0 for message in bench.joints)
 
 
 @pytest.mark.requirement("R-03", "P-22")
@@ -103,7 +116,7 @@ def test_a_hand_opens_and_closes(bench: Bench) -> None:
     for position in (0.03, 0.0):
         goal = ParallelGripperCommand.Goal(command=JointState(name=[bench.FINGER], position=[position]))
         _, result = bench.ros.send_goal(client, goal)
-        answer = bench.ros.result(result, 20.0).result
+        answer = bench.ros.result(result).result
         assert (answer.reached_goal, answer.stalled) == (True, False)
         assert bench.position(bench.FINGER) == pytest.approx(position, abs=0.002)
 
@@ -117,6 +130,6 @@ def test_the_emergency_stop_is_of_this_node(bench: Bench) -> None:
     _, result = bench.ros.send_goal(client, goal)
     bench.spin_sim(1.0)
     assert bench.call(Trigger, "/stop").success
-    assert bench.ros.result(result, 5.0).result.error_string.startswith("the emergency stop is latched")
+    assert bench.ros.result(result).result.error_string.startswith("the emergency stop is latched")
     assert bench.call(Trigger, "/arm_control/reset").success
     assert move(bench, "/arm_control", 0.1, 1.0).error_code == 0

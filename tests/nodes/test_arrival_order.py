@@ -33,7 +33,7 @@ class Arm(Bench):
         self.cloud_node = ros.add(CloudNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()]))
         self.clouds: list[PointCloud2] = []
         ros.node.create_subscription(PointCloud2, "/overhead/depth/points", self.clouds.append, QOS_SENSOR)
-        ros.spin_until(lambda: self.joints.get_subscription_count() == 2, 10.0, "both listen to the joints")
+        ros.spin_until(lambda: self.joints.get_subscription_count() == 2, what="both listen to the joints")
         tool = ROBOT.link_pose("openarm_left_hand_tcp", dict.fromkeys(JOINTS, 0.0))
         self.image = sheet(tool[2, 3])
 
@@ -56,7 +56,7 @@ class Arm(Bench):
                 self.send(array_to_image(self.image, "16UC1", FRAME, self.t_ns), joints=False)
             return bool(condition())
 
-        self.ros.spin_until(step, 10.0, what)
+        self.ros.spin_until(step, what=what)
 
     def made(self) -> bool:
         """Whether there are a cloud and a map of the image."""
@@ -66,9 +66,9 @@ class Arm(Bench):
     def results(self) -> tuple[bytes, bytes]:
         """Points and octree of the image; both are then forgotten."""
         points, tree = bytes(self.clouds[-1].data), bytes(self.maps[-1].data)
-        self.ros.spin_until(lambda: self.node.idle, 10.0, "no update runs")
+        self.ros.spin_until(lambda: self.node.idle, what="no update runs")
         self.call(Empty, "/octomap/reset")
-        self.ros.spin_until(lambda: not len(self.maps[-1].data), 10.0, "the map is empty")
+        self.ros.spin_until(lambda: not len(self.maps[-1].data), what="the map is empty")
         return points, tree
 
 
@@ -88,7 +88,7 @@ def test_clouds_and_maps_do_not_depend_on_what_arrives_first(ros, tmp_path) -> N
         lambda: bench.cloud_node.waiting_ns("overhead") == bench.t_ns and not bench.node.idle, "both have the frame"
     )
     bench.state_at(12, SWEEP)
-    ros.spin_until(bench.made, 10.0, "cloud and map, the frame first")
+    ros.spin_until(bench.made, what="cloud and map, the frame first")
     late = bench.results()
 
     bench.t_ns += 1_000 * MS

@@ -71,7 +71,7 @@ def test_diagnostics_are_published_each_second(ros) -> None:
     ros.node.create_subscription(DiagnosticArray, "/diagnostics", got.append, QOS_COMMAND)
     node = ros.add(BaseNode("example", _Example))
     node.diagnose(True, "all is well", frames=3)
-    ros.spin_until(lambda: any(s.message == "all is well" for m in got for s in m.status), 20.0, "a status")
+    ros.spin_until(lambda: any(s.message == "all is well" for m in got for s in m.status), what="a status")
     status = got[-1].status[0]
     assert status.name == "example: status"
     assert status.level == b"\x00"
@@ -140,7 +140,7 @@ def test_a_signal_ends_the_process_in_order_with_exit_code_0(stop: signal.Signal
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(stop)
-        out, _ = process.communicate(timeout=10.0)
+        out, _ = process.communicate(timeout=60.0)
         assert (process.returncode, out) == (0, "closed\n")
 
 
@@ -163,7 +163,7 @@ def test_a_signal_lets_the_node_bring_to_rest_what_it_moves_while_the_graph_is_t
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGTERM)
-        out, _ = process.communicate(timeout=10.0)
+        out, _ = process.communicate(timeout=60.0)
         assert (process.returncode, out) == (0, "held True\nclosed\n")
 
 
@@ -178,7 +178,7 @@ def test_a_signal_ends_a_node_that_holds_an_arm_with_exit_code_0() -> None:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
-        out, error = process.communicate(timeout=10.0)
+        out, error = process.communicate(timeout=60.0)
         assert (process.returncode, out) == (0, "closed\n"), error
 
 
@@ -202,7 +202,7 @@ def test_an_end_that_takes_too_long_is_located_by_a_second_signal() -> None:
 
 def test_a_wrong_parameter_ends_the_process_with_a_sentence_and_exit_code_1() -> None:
     command = [sys.executable, "-c", _SCRIPT, "--ros-args", "-p", "rate:=fast"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
     assert done.returncode == 1
     assert "rate" in done.stdout + done.stderr
     assert "Traceback" not in done.stderr

@@ -54,6 +54,7 @@ while True:
 """
 
 
+@pytest.mark.long
 @pytest.mark.alone
 @pytest.mark.requirement("N-23")
 def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp_path) -> None:
@@ -89,9 +90,9 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp
     bridge = run("-m", "openarm_sim_bridge.ros.node", "--ros-args", "-p", "scene:=empty", "-p", "images:=false")
     flood: subprocess.Popen | None = None
     try:
-        ros.spin_until(lambda: published and diagnostics, 30.0, "the bridge")
+        ros.spin_until(lambda: published and diagnostics, what="the bridge")
         flood = run("-c", FLOOD, "4000")
-        ros.spin_until(lambda: int(status().get("commands_per_s", 0)) > 300, 20.0, "the flood to be counted")
+        ros.spin_until(lambda: int(status().get("commands_per_s", 0)) > 300, what="the flood to be counted")
         published.clear()
         heard = len(diagnostics)
         begin = sent()
@@ -100,16 +101,16 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp
         end = sent()
         assert end[1] - begin[1] > 3000.0 * (end[0] - begin[0]) > 0.0, "no flood"
         reports = len(diagnostics)
-        ros.spin_until(lambda: len(diagnostics) >= reports + 2, 20.0, "/diagnostics")
+        ros.spin_until(lambda: len(diagnostics) >= reports + 2, what="/diagnostics")
         mean, p99 = periods.mean(), np.percentile(periods, 99)
         kept = abs(mean - 10.0) < 0.2 and p99 <= 17.0  # 15 is reported, which is measured before they are published
         said = [report.status[0].message for report in diagnostics[heard:]]
         assert kept or any(message.startswith(("late", "slower")) for message in said), (mean, p99, said, status())
         # It still listens to others.
         assert ros.call(ros.node.create_client(SetPause, "/sim/set_pause"), SetPause.Request(paused=True)).success
-        ros.spin_until(lambda: status()["message"] == "paused", 20.0, "the pause on /diagnostics")
+        ros.spin_until(lambda: status()["message"] == "paused", what="the pause on /diagnostics")
         bridge.send_signal(signal.SIGINT)
-        code = bridge.wait(timeout=10.0)
+        code = bridge.wait(timeout=60.0)
         errors = (tmp_path / "log").read_text()
         assert code == 0, errors[-2000:]
         assert "1 positions, expected as many" in errors  # said once a second, not four thousand times

@@ -26,14 +26,14 @@ def test_the_gripper_reaches_its_goal(bench, position: float) -> None:
     assert answer.result.reached_goal
     assert not answer.result.stalled
     assert answer.result.state.position[0] == pytest.approx(position, abs=0.001)
-    bench.ros.spin_until(lambda: abs(bench.position(bench.FINGER) - position) < 0.001, 20.0, "a joint state of it")
+    bench.ros.spin_until(lambda: abs(bench.position(bench.FINGER) - position) < 0.001, what="a joint state of it")
 
 
 @pytest.mark.requirement("P-22")
 def test_a_gripper_stalls_on_an_object_and_says_so(bench) -> None:
     """A box is put between fingers that are nearly closed, in a world that stands still."""
     level = bench.posture(lambda T: [10.0 * T[2, 1], *(T[:3, 3] - [0.40, -0.39, 0.75])])  # opening axis horizontal
-    bench.ros.result(bench.follow(bench.goal((1.5, level)))[1], 15.0)
+    bench.ros.result(bench.follow(bench.goal((1.5, level)))[1])
     assert bench.grip(0.016).result.reached_goal
     assert bench.call(SetPause, "/sim/set_pause", paused=True).success
     T = bench.tcp_pose()
@@ -50,7 +50,7 @@ def test_a_gripper_stalls_on_an_object_and_says_so(bench) -> None:
     handle, future = bench.send_grip(JointState(name=[bench.FINGER], position=[0.0]))
     assert handle.accepted
     assert bench.call(SetPause, "/sim/set_pause", paused=False).success
-    answer = bench.ros.result(future, 15.0)
+    answer = bench.ros.result(future)
     assert answer.status == GoalStatus.STATUS_SUCCEEDED
     assert (answer.result.stalled, answer.result.reached_goal) == (True, False)
     assert 2 * answer.result.state.position[0] == pytest.approx(0.030, abs=0.001)
@@ -60,7 +60,7 @@ def test_a_gripper_stalls_on_an_object_and_says_so(bench) -> None:
         for finger in ("left", "right")
     ]
     wrists = bench.collect(WrenchStamped, "/right_force_torque_sensor_broadcaster/wrench", QOS_SENSOR)
-    bench.ros.spin_until(lambda: all(pads) and wrists, 20.0, "force sensors")
+    bench.ros.spin_until(lambda: all(pads) and wrists, what="force sensors")
     for got in pads:  # each presses with half of the force
         force = got[-1].wrench.force
         assert math.hypot(force.x, force.y, force.z) == pytest.approx(15.0, abs=1.5)
@@ -73,7 +73,7 @@ def test_a_gripper_stalls_on_an_object_and_says_so(bench) -> None:
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
     assert bench.call(InjectFault, "/sim/inject_fault", name="friction_lowered", parameters="{scale: 0.0}").success
     bench.ros.spin_until(
-        lambda: got and any(o.name == "held" and o.pose.position.z < 0.6 for o in got[-1].objects), 20.0, "its fall"
+        lambda: got and any(o.name == "held" and o.pose.position.z < 0.6 for o in got[-1].objects), what="its fall"
     )
 
 

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
@@ -26,16 +24,15 @@ def test_pause_and_step(bench) -> None:
     assert bench.call(SetPause, "/sim/set_pause", paused=True).success
     bench.ros.spin_until(
         lambda: len(bench.joints) > 2 and bench.joints[-1].header.stamp == bench.joints[-2].header.stamp,
-        5.0,
-        "time to stand",
+        what="time to stand",
     )
     before = bench.t_ns
     n = len(bench.joints)
-    bench.ros.spin_until(lambda: len(bench.joints) >= n + 3, 20.0, "signs of life")
+    bench.ros.spin_until(lambda: len(bench.joints) >= n + 3, what="signs of life")
     assert bench.t_ns == before
     answer = bench.call(StepSimulation, "/sim/step", steps=203)
     assert answer.success, answer.message
-    bench.ros.spin_until(lambda: bench.t_ns == before + 203 * 2_000_000, 20.0, "203 steps of 2 ms")
+    bench.ros.spin_until(lambda: bench.t_ns == before + 203 * 2_000_000, what="203 steps of 2 ms")
     assert not bench.call(StepSimulation, "/sim/step", steps=0).success
     assert bench.call(SetPause, "/sim/set_pause", paused=False).success
     bench.spin_sim(0.2)
@@ -43,15 +40,12 @@ def test_pause_and_step(bench) -> None:
 
 @pytest.mark.requirement("P-25")
 def test_reset_puts_the_robot_back_and_aborts_what_runs(bench) -> None:
-    _, future = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
+    _, future = bench.follow(bench.goal((6.0, bench.NEAR_HOME)))
     bench.spin_sim(1.5)
-    client = bench.ros.node.create_client(ResetWorld, "/sim/reset_world")
-    bench.ros.spin_until(client.service_is_ready, 20.0, "the service")
-    before, began = bench.t_ns, time.monotonic()
-    answer = bench.ros.call(client, ResetWorld.Request())
-    assert time.monotonic() - began < 2.0
+    before = bench.t_ns
+    answer = bench.call(ResetWorld, "/sim/reset_world")
     assert answer.success
-    assert "reset" in bench.ros.result(future, 20.0).result.error_string
+    assert "reset" in bench.ros.result(future).result.error_string
     bench.spin_sim(0.3)
     assert bench.t_ns > before
     np.testing.assert_allclose(bench.arm, bench.HOME, atol=0.01)
@@ -75,7 +69,7 @@ def test_reset_takes_a_keyframe_and_overrides(bench) -> None:
     )
     assert answer.success, answer.message
     up = bench.node.description.group_state("right_arm", "hands_up")
-    bench.ros.spin_until(lambda: abs(bench.arm[6] - 0.25) < 0.01, 20.0, "a joint state of the new posture")
+    bench.ros.spin_until(lambda: abs(bench.arm[6] - 0.25) < 0.01, what="a joint state of the new posture")
     np.testing.assert_allclose(bench.arm, [*(up[name] for name in bench.ARM[:6]), 0.25], atol=0.01)
     assert bench.position(bench.FINGER) == pytest.approx(0.03, abs=0.001)
     red = next(o for o in bench.fresh(got, 2)[-1].objects if o.name == "red_cube").pose.position
@@ -83,7 +77,7 @@ def test_reset_takes_a_keyframe_and_overrides(bench) -> None:
     bench.spin_sim(0.5)
     assert bench.arm[6] == pytest.approx(0.25, abs=0.01)  # held there
     assert bench.call(ResetWorld, "/sim/reset_world").success  # the overrides are of one reset
-    bench.ros.spin_until(lambda: np.allclose(bench.arm, bench.HOME, atol=0.01), 20.0, "home again")
+    bench.ros.spin_until(lambda: np.allclose(bench.arm, bench.HOME, atol=0.01), what="home again")
 
 
 @pytest.mark.requirement("P-25")
@@ -107,7 +101,7 @@ def test_a_reset_that_makes_no_sense_changes_nothing(bench) -> None:
         assert not answer.success, fields
         for part in parts:
             assert part in answer.message
-    assert bench.ros.result(running, 10.0).result.error_code == 0  # the arm went on
+    assert bench.ros.result(running).result.error_code == 0  # the arm went on
 
 
 def test_a_diverged_world_takes_no_command_until_it_is_reset(bench, tmp_path, monkeypatch) -> None:
@@ -118,14 +112,14 @@ def test_a_diverged_world_takes_no_command_until_it_is_reset(bench, tmp_path, mo
     _, running = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
     bench.spin_sim(0.3)
     simulation.call(lambda: simulation.world.data.qvel.fill(np.nan))
-    answer = bench.ros.result(running, 20.0)
+    answer = bench.ros.result(running)
     assert answer.status == GoalStatus.STATUS_ABORTED
     assert "diverged" in answer.result.error_string
     assert "The last second is in" in answer.result.error_string
     _, refused = bench.follow(bench.goal((1.0, bench.NEAR_HOME)))
-    assert "no command is taken" in bench.ros.result(refused, 20.0).result.error_string
+    assert "no command is taken" in bench.ros.result(refused).result.error_string
     assert not bench.send_grip(JointState(name=[bench.FINGER], position=[0.02]))[0].accepted
-    bench.ros.spin_until(lambda: any("diverged" in s.message for m in got for s in m.status), 20.0, "/diagnostics")
+    bench.ros.spin_until(lambda: any("diverged" in s.message for m in got for s in m.status), what="/diagnostics")
     assert bench.call(ResetWorld, "/sim/reset_world").success
     assert bench.grip(0.02).result.reached_goal
 
@@ -136,7 +130,7 @@ def test_another_scene_is_loaded_while_time_goes_on(bench) -> None:
     answer = bench.call(ResetWorld, "/sim/reset_world", scene="random", seed=7)
     assert answer.success, answer.message
     bench.ros.spin_until(
-        lambda: got and got[-1].objects and got[-1].objects[0].name != "red_cube", 20.0, "the new objects"
+        lambda: got and got[-1].objects and got[-1].objects[0].name != "red_cube", what="the new objects"
     )
     names = [o.name for o in got[-1].objects]
     bad = bench.call(ResetWorld, "/sim/reset_world", scene="nowhere")
@@ -144,7 +138,7 @@ def test_another_scene_is_loaded_while_time_goes_on(bench) -> None:
     assert "SCENE_INVALID" in bad.message
     assert "demo" in bad.message
     n = len(got)
-    bench.ros.spin_until(lambda: len(got) > n + 2, 20.0)
+    bench.ros.spin_until(lambda: len(got) > n + 2)
     assert [o.name for o in got[-1].objects] == names
 
 
@@ -156,7 +150,7 @@ def test_spawn_adds_an_object_on_the_table_and_names_what_is_wrong(bench) -> Non
     assert bench.call(
         SpawnObject, "/sim/spawn_object", name="extra", shape="box", size=size, color="purple", pose=pose
     ).success
-    bench.ros.spin_until(lambda: any(o.name == "extra" for m in got for o in m.objects), 20.0, "the object")
+    bench.ros.spin_until(lambda: any(o.name == "extra" for m in got for o in m.objects), what="the object")
     extra = next(o for o in got[-1].objects if o.name == "extra")
     assert extra.pose.position.z == pytest.approx(0.42, abs=0.002)
     for change, text in (
@@ -173,4 +167,4 @@ def test_spawn_adds_an_object_on_the_table_and_names_what_is_wrong(bench) -> Non
         assert not answer.success, change
         assert text in answer.message
     assert bench.call(ResetWorld, "/sim/reset_world").success
-    bench.ros.spin_until(lambda: all(o.name != "extra" for o in got[-1].objects), 20.0, "the object to be gone")
+    bench.ros.spin_until(lambda: all(o.name != "extra" for o in got[-1].objects), what="the object to be gone")

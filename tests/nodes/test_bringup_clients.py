@@ -23,6 +23,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import ns_to_stamp
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import Step
+from tests.conftest import DEADLINE_S
 
 LATCHED = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -34,11 +35,11 @@ def probe(ros) -> Iterator[ReadinessClient]:
     client.close()
 
 
-def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    deadline = time.monotonic() + seconds
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + DEADLINE_S
     while not condition():
         assert time.monotonic() < deadline, "not within the time"
-        time.sleep(0.02)
+        threading.Event().wait(0.02)
 
 
 def test_probe_sees_topics_services_and_first_messages(ros, probe: ReadinessClient) -> None:
@@ -73,7 +74,7 @@ def test_probe_lists_parameters_and_says_who_does_not_answer(ros, probe: Readine
     node = ros.add(Node("arm"))
     node.declare_parameter("speed.max", 1.0)
     spinning = threading.Event()
-    spinner = threading.Thread(target=lambda: ros.spin_until(spinning.is_set, timeout=20.0))
+    spinner = threading.Thread(target=lambda: ros.spin_until(spinning.is_set, timeout=60.0))
     spinner.start()
     try:
         assert "speed.max" in probe.parameters("arm")
@@ -115,12 +116,12 @@ def test_observer_keeps_tracks_states_and_resets_the_world(ros) -> None:
     world.status.publish(GraspStatus(state="IDLE", reason="waiting"))
     steps: list[Step] = []
     done = threading.Event()
-    spinner = threading.Thread(target=lambda: ros.spin_until(done.is_set, timeout=30.0))
+    spinner = threading.Thread(target=lambda: ros.spin_until(done.is_set, timeout=60.0))
     spinner.start()
     try:
         with Observer(int(os.environ["ROS_DOMAIN_ID"]), steps.append) as observer:
-            observer.wait(lambda: len(observer.track("cube")) >= 3 or None, 10.0, "truth")
-            observer.wait(lambda: observer.steps() or None, 10.0, "the latched state")
+            observer.wait(lambda: len(observer.track("cube")) >= 3 or None, DEADLINE_S, "truth")
+            observer.wait(lambda: observer.steps() or None, DEADLINE_S, "the latched state")
             track = observer.track("cube")
             assert track[0].p_world[0] == 0.5
             assert all(a.t_ns < b.t_ns for a, b in itertools.pairwise(track))
@@ -136,7 +137,7 @@ def test_observer_keeps_tracks_states_and_resets_the_world(ros) -> None:
                 status = GraspStatus(state=state)
                 status.header.stamp = ns_to_stamp(t_ns)
                 world.status.publish(status)
-            observer.wait(lambda: observer.steps() or None, 10.0, "a state")
+            observer.wait(lambda: observer.steps() or None, DEADLINE_S, "a state")
             assert [step.state for step in observer.steps()] == ["DETECT"]
             with pytest.raises(OpenArmError, match=r"a unicorn was not there within 0.2 s"):
                 observer.wait(lambda: None, 0.2, "a unicorn")

@@ -49,9 +49,9 @@ def test_a_usb_camera_has_the_topics_of_a_camera_without_depth_and_is_opened_aga
     )
     reports = collect(ros, DiagnosticArray, "/diagnostics", QOS_COMMAND)
     ros.add(usb_camera.make(parameter_overrides=parameters(**values, device=str(tmp_path / "film.avi"))))
-    ros.spin_until(lambda: any("can't open" in text for text in messages_of(reports, "usb_camera")), 20.0, "a refusal")
+    ros.spin_until(lambda: any("can't open" in text for text in messages_of(reports, "usb_camera")), what="a refusal")
     film(tmp_path, 200)  # now it is plugged in
-    ros.spin_until(lambda: images and infos, 30.0, "a picture")
+    ros.spin_until(lambda: images and infos, what="a picture")
     assert (images[0].encoding, images[0].width, images[0].height) == ("rgb8", WIDTH, HEIGHT)
     assert images[0].header.frame_id == infos[0].header.frame_id == "desk_color_optical_frame"
     assert infos[0].k[0] == 90.0
@@ -97,12 +97,11 @@ def test_a_realsense_has_the_topics_of_the_simulated_cameras_and_is_opened_again
 
     ros.spin_until(
         lambda: any("no RealSense is plugged in" in text for text in messages_of(reports, "realsense_camera")),
-        20.0,
-        "a refusal",
+        what="a refusal",
     )
     for _ in range(2):  # plugged in, lost, and plugged in again
         plugged[:] = [SoftwareRealSense("42")]
-        ros.spin_until(lambda: streams(plugged[0]), 30.0, "pictures")
+        ros.spin_until(lambda: streams(plugged[0]), what="pictures")
         image, info = got["depth/image_raw"][0], got["depth/camera_info"][0]
         assert image.encoding == "16UC1"
         assert image.header.frame_id == info.header.frame_id == "overhead_color_optical_frame"
@@ -115,8 +114,7 @@ def test_a_realsense_has_the_topics_of_the_simulated_cameras_and_is_opened_again
                 "gave no picture" in text or "no RealSense" in text
                 for text in messages_of(reports[n:], "realsense_camera")
             ),
-            20.0,
-            "a fault",
+            what="a fault",
         )
         for messages in got.values():
             messages.clear()

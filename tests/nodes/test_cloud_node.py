@@ -50,7 +50,7 @@ class Bench:
                 self.info.publish(info_from_intrinsics(K, frame, self.t_ns))
             return condition()
 
-        self.ros.spin_until(step, 10.0, what)
+        self.ros.spin_until(step, what=what)
 
 
 def flat(millimetres: int = 700):
@@ -151,13 +151,13 @@ def test_images_are_subscribed_to_only_while_points_have_a_subscriber(ros) -> No
     """Of that camera alone."""
     bench = Bench(ros)
     wrist = ros.node.create_publisher(Image, "/wrist/depth/image_raw", QOS_SENSOR)
-    ros.spin_until(lambda: ros.node.count_publishers("/wrist/depth/points"), 10.0, "the node is up")
+    ros.spin_until(lambda: ros.node.count_publishers("/wrist/depth/points"), what="the node is up")
     assert bench.depth.get_subscription_count() == 0
     watcher = bench.watch()
-    ros.spin_until(lambda: bench.depth.get_subscription_count(), 10.0, "the camera is listened to")
+    ros.spin_until(lambda: bench.depth.get_subscription_count(), what="the camera is listened to")
     assert wrist.get_subscription_count() == 0
     ros.node.destroy_subscription(watcher)
-    ros.spin_until(lambda: not bench.depth.get_subscription_count(), 10.0, "the camera is let go")
+    ros.spin_until(lambda: not bench.depth.get_subscription_count(), what="the camera is let go")
 
 
 @pytest.mark.parametrize(

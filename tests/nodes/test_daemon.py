@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -99,12 +100,11 @@ class Graph:
 
     def wait(self, condition: Callable[[], object], what: str) -> None:
         """Wait while the node spins."""
-        waited = threading.Event()
-        for _ in range(round(DEADLINE / 0.02)):
-            if condition():
-                return
+        waited, deadline = threading.Event(), time.monotonic() + DEADLINE
+        while not condition():
+            if time.monotonic() > deadline:
+                pytest.fail(f"not within {DEADLINE:g} s: {what}")
             waited.wait(0.02)
-        pytest.fail(f"not within {DEADLINE:g} s: {what}")
 
     def _pause(self, request: SetPause.Request, response: SetPause.Response) -> SetPause.Response:
         response.success, response.message = request.paused, "paused" if request.paused else "only true is taken"

@@ -124,7 +124,7 @@ def test_the_height_of_the_table_is_measured_from_its_surface_or_a_block(ros, be
 
     early = ros.call(client, MeasureTable.Request())
     assert (early.success, early.code) == (False, "NOT_READY")
-    ros.spin_until(lambda: camera.pubs["depth"].get_subscription_count() == 2, 10.0, "it listens because it was asked")
+    ros.spin_until(lambda: camera.pubs["depth"].get_subscription_count() == 2, what="it listens because it was asked")
     surface = ask()
     assert surface.success, surface.message
     assert surface.height == pytest.approx(TABLE, abs=0.0005)
@@ -178,12 +178,12 @@ def test_images_are_subscribed_to_only_while_detections_have_a_subscriber(ros) -
     """No subscription without demand; demand by any output starts it, its end ends it."""
     camera = FakeCamera(ros)
     ros.add(DetectNode())
-    ros.spin_until(lambda: ros.node.count_subscribers("/tf_static") == 1, 10.0, "the detector is up")
+    ros.spin_until(lambda: ros.node.count_subscribers("/tf_static") == 1, what="the detector is up")
     assert camera.unwatched()
     watch = Watch(ros, MarkerArray, "/detection_markers")
-    ros.spin_until(camera.watched, 10.0, "the camera is listened to")
+    ros.spin_until(camera.watched, what="the camera is listened to")
     ros.node.destroy_subscription(watch.subscription)
-    ros.spin_until(camera.unwatched, 10.0, "the camera is let go")
+    ros.spin_until(camera.unwatched, what="the camera is let go")
 
 
 @pytest.mark.requirement("A-04")
@@ -195,7 +195,7 @@ def test_old_frames_are_dropped_not_queued(ros, bench) -> None:
     for i in range(20):
         bench.camera.publish(bench.t_ns + 10 * i * MS)
         ros.executor.spin_once(timeout_sec=0.02)
-    ros.spin_until(lambda: len(bench.watch.got) > count, 20.0, "an answer")
+    ros.spin_until(lambda: len(bench.watch.got) > count, what="an answer")
     assert len(bench.watch.got) - count <= 2
 
 
@@ -269,7 +269,7 @@ def test_what_is_seen_with_wrong_intrinsics_is_an_obstacle_but_no_target_and_dia
     assert variances() == -1.0, "one frame is no alarm"
     bench.said("INTRINSICS_MISMATCH: camera_info (fx 457.3, fy 457.3, cx 319.5, cy 239.5) is up to 40 pixels off")
     assert variances() == -2.0
-    ros.spin_until(lambda: status() == (2, "INTRINSICS_MISMATCH"), 10.0, "diagnostics with the code")
+    ros.spin_until(lambda: status() == (2, "INTRINSICS_MISMATCH"), what="diagnostics with the code")
     bench.camera.K = replace(right, cx=right.cx + 8.0)
     assert variances() > 0.0
     calibrated.publish(info_from_intrinsics(right, bench.camera.frame, 0))
@@ -327,7 +327,7 @@ def test_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) -> None:
     t = bench.node.waiting_ns
     for offset, q in ((-8, 0.46), (12, 0.56), (400, 1.2)):
         bench.camera.joints.publish(arm(t + offset * MS, q, 5.0))
-    ros.spin_until(lambda: bench.watch.got, 20.0, "the detection of the frame that waited")
+    ros.spin_until(lambda: bench.watch.got, what="the detection of the frame that waited")
     assert stamp_to_ns(bench.watch.got[0].header.stamp) == t
     (found,) = bench.watch.got[0].detections
     np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)
@@ -341,10 +341,10 @@ def test_a_joint_state_just_before_the_image_is_not_enough_while_the_next_is_to_
     t = bench.node.waiting_ns
     bench.camera.joints.publish(arm(t - 3 * MS, 0.47, 10.0))
     looks_again = time.monotonic() + 0.3
-    ros.spin_until(lambda: bench.watch.got or time.monotonic() > looks_again, 20.0, "time to look again")
+    ros.spin_until(lambda: bench.watch.got or time.monotonic() > looks_again, what="time to look again")
     assert not bench.watch.got
     bench.camera.joints.publish(arm(t + 12 * MS, 0.62, 10.0))
-    ros.spin_until(lambda: bench.watch.got, 20.0, "the detection of the frame that waited")
+    ros.spin_until(lambda: bench.watch.got, what="the detection of the frame that waited")
     (found,) = bench.watch.got[0].detections
     np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)
 
@@ -353,7 +353,7 @@ def test_a_joint_state_just_before_the_image_is_not_enough_while_the_next_is_to_
 def test_a_frame_20_ms_from_any_joint_state_is_skipped(ros) -> None:
     """Nothing within 5 ms and nothing that brackets: skipped and named, no detection, and the node goes on."""
     bench = on_arm(ros, transform_wait=0.1)
-    ros.spin_until(bench.camera.joints.get_subscription_count, 20.0, "joint states are listened to")
+    ros.spin_until(bench.camera.joints.get_subscription_count, what="joint states are listened to")
 
     def with_joints(offset_ms: int):
         def make(t_ns: int) -> CameraInfo:

@@ -35,7 +35,7 @@ class Foxglove:
     def address(self, token: str | None = None) -> str:
         return f"ws://127.0.0.1:{self.node.port}/?token={self.node.token if token is None else token}"
 
-    def run(self, work: Callable[[aiohttp.ClientSession], Awaitable[Any]], seconds: float = 20.0) -> Any:
+    def run(self, work: Callable[[aiohttp.ClientSession], Awaitable[Any]], seconds: float = 60.0) -> Any:
         outcome: list[Any] = []
 
         async def main() -> None:
@@ -113,7 +113,7 @@ def test_a_topic_is_advertised_with_its_definition_and_its_messages_come_byte_fo
 
     assert publisher.get_subscription_count() == 0  # lazily: no client has asked yet
     foxglove.run(look)
-    ros.spin_until(lambda: publisher.get_subscription_count() == 0, 10.0, "the subscription ends with the clients")
+    ros.spin_until(lambda: publisher.get_subscription_count() == 0, what="the subscription ends with the clients")
 
 
 def test_a_service_is_called_from_foxglove(ros, foxglove: Foxglove) -> None:

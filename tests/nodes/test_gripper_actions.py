@@ -28,11 +28,11 @@ def test_the_classic_action_reaches_the_real_joint(bridge, position: float) -> N
     goal = GripperCommand.Goal(command=Command(position=position, max_effort=10.0))
     handle, future = bench.ros.send_goal(client_of(bench), goal)
     assert handle.accepted
-    answer = bench.ros.result(future, 15.0)
+    answer = bench.ros.result(future)
     assert answer.status == GoalStatus.STATUS_SUCCEEDED
     assert (answer.result.reached_goal, answer.result.stalled) == (True, False)
     assert answer.result.position == pytest.approx(position, abs=0.001)
-    bench.ros.spin_until(lambda: abs(bench.position(bench.FINGER) - position) < 0.001, 20.0, "a joint state of it")
+    bench.ros.spin_until(lambda: abs(bench.position(bench.FINGER) - position) < 0.001, what="a joint state of it")
     bad, _ = bench.ros.send_goal(client_of(bench), GripperCommand.Goal(command=Command(position=0.2)))
     assert not bad.accepted
 
@@ -53,8 +53,8 @@ def test_the_grasp_node_speaks_the_type_that_the_bridge_serves(bridge, action: s
             faults.append(error)
             return False
 
-    assert ros.result(ros.executor.create_task(grip), 20.0), faults
-    ros.spin_until(lambda: abs(bench.position(bench.FINGER) - 0.03) < 0.001, 20.0, "a joint state of it")
+    assert ros.result(ros.executor.create_task(grip)), faults
+    ros.spin_until(lambda: abs(bench.position(bench.FINGER) - 0.03) < 0.001, what="a joint state of it")
     assert dict(get_action_names_and_types(ros.node))[NAME] == [f"control_msgs/action/{TYPES[action]}"]
 
 
@@ -79,5 +79,5 @@ def test_a_gripper_behind_a_trajectory_controller_is_asked_for_a_position(bridge
         await grasp._robot._nodes.begin(list)
         return await grasp._robot.grip("right", bench.FINGER, 0.03, "open")
 
-    assert ros.result(ros.executor.create_task(grip), 20.0)
-    ros.spin_until(lambda: abs(bench.position(bench.FINGER) - 0.03) < 0.001, 20.0, "a joint state of it")
+    assert ros.result(ros.executor.create_task(grip))
+    ros.spin_until(lambda: abs(bench.position(bench.FINGER) - 0.03) < 0.001, what="a joint state of it")

@@ -16,17 +16,18 @@ from tests.nodes.octomap_bench import FRAME, Bench, sheet
 PERIOD, FRAME_PERIOD = 0.5, 1.0 / 30.0
 
 
-@pytest.mark.alone
 @pytest.mark.requirement("A-58")
 def test_cameras_run_at_30_hz(seeing) -> None:
     """By the stamps of their infos; images are drawn because one is subscribed to."""
     seeing.collect(Image, "/wrist/depth/image_raw", QOS_SENSOR)
     infos = seeing.collect(CameraInfo, "/wrist/depth/camera_info", QOS_SENSOR)
-    seeing.ros.spin_until(lambda: len(infos) > 60, 30.0, "sixty frames")
+    seeing.ros.spin_until(lambda: len(infos) > 60, what="sixty frames")
     between = np.diff([stamp_to_ns(info.header.stamp) for info in infos]) * 1e-9
-    assert np.median(between) == pytest.approx(FRAME_PERIOD, abs=0.0035)  # of ticks of 10 ms
+    between = between[between < 1.5 * FRAME_PERIOD]  # a starved probe misses some
+    assert np.mean(between) == pytest.approx(FRAME_PERIOD, abs=0.0035)  # of ticks of 10 ms
 
 
+@pytest.mark.long
 @pytest.mark.alone
 @pytest.mark.requirement("A-58")
 def test_a_map_of_2_hz_is_made_of_the_newest_frame_of_a_30_hz_camera(ros, tmp_path) -> None:
@@ -54,7 +55,7 @@ def test_a_map_of_2_hz_is_made_of_the_newest_frame_of_a_30_hz_camera(ros, tmp_pa
             came.extend([time.monotonic()] * (len(bench.maps) - len(came)))
             return bool(condition())
 
-        ros.spin_until(step, 30.0, what)
+        ros.spin_until(step, what=what)
 
     until(lambda: len(bench.maps) >= 3, "the first maps")
     first = len(bench.maps) - 1

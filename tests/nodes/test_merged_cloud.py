@@ -58,7 +58,7 @@ class Moving:
             self.images[name] = (after, scans[name])
         inputs = (self.joints, *self.depth.values(), *self.info.values())
         heard = "the node listens to both cameras and the joints"
-        ros.spin_until(lambda: all(pub.get_subscription_count() for pub in inputs), 10.0, heard)
+        ros.spin_until(lambda: all(pub.get_subscription_count() for pub in inputs), what=heard)
 
     def at(self, offset_ns: int) -> dict[str, float]:
         name = "openarm_right_joint1"
@@ -85,7 +85,7 @@ class Moving:
                     self.info[name].publish(info_from_intrinsics(scan.intrinsics, frame, t_ns + after))
             return any(stamp_to_ns(cloud.header.stamp) % (1_000 * MS) == LATER for cloud in self.merged)
 
-        self.ros.spin_until(step, 30.0, "a merged cloud")
+        self.ros.spin_until(step, what="a merged cloud")
         return t_ns, self.merged[-1]
 
 

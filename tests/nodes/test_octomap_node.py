@@ -55,7 +55,7 @@ def test_images_become_a_latched_octree(bench) -> None:
     assert (newest.header.frame_id, newest.id, newest.binary, newest.resolution) == (BASE_FRAME, "OcTree", True, 0.02)
     late: list[Octomap] = []
     bench.ros.node.create_subscription(Octomap, "octomap_full", late.append, QOS_LATCHED)
-    bench.ros.spin_until(lambda: late, 10.0, "the full map")
+    bench.ros.spin_until(lambda: late, what="the full map")
     assert bench.state(ON_TABLE, late[0]) == "occupied"
     assert not late[0].binary
     for name, full in (("octomap_binary", False), ("octomap_full", True)):
@@ -91,17 +91,17 @@ def test_coarse_maps_are_answered(bench) -> None:
 def test_reset_is_visible_at_once_and_boxes_are_cleared(bench) -> None:
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
     # an update under way would put back what it saw
-    bench.ros.spin_until(lambda: bench.node.idle, 10.0, "all images are in the map")
+    bench.ros.spin_until(lambda: bench.node.idle, what="all images are in the map")
     box = BoundingBoxQuery.Request(min=Point(x=0.4, y=0.2, z=0.38), max=Point(x=0.5, y=0.3, z=0.44))
     bench.call(BoundingBoxQuery, "/octomap/clear_bbox", box)
-    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", 20.0, "the box is free")
+    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", what="the box is free")
     answer = bench.call(ClearMap, "/octomap/clear", ClearMap.Request(min=box.min, max=box.max, state="unknown"))
     assert (answer.success, answer.code, answer.cells) == (True, "OK", 6 * 6 * 4)
-    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 20.0, "the box is unknown")
+    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", what="the box is unknown")
     answer = bench.call(ClearMap, "/octomap/clear", ClearMap.Request(min=box.min, max=box.max))
-    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", 20.0, "the box is free")
+    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", what="the box is free")
     bench.call(Empty, "/octomap/reset")
-    bench.ros.spin_until(lambda: len(bench.maps[-1].data) == 0, 20.0, "the map is empty")
+    bench.ros.spin_until(lambda: len(bench.maps[-1].data) == 0, what="the map is empty")
     wrong = BoundingBoxQuery.Request(min=Point(x=1.0), max=Point(x=0.0))
     bench.call(BoundingBoxQuery, "/octomap/clear_bbox", wrong)
     for request, text in (
@@ -169,12 +169,12 @@ def test_maps_are_saved_and_loaded_and_damaged_files_leave_the_map_alone(bench, 
         assert text in answer.message
     assert bytes(bench.call(GetOctomap, "octomap_full").map.data) == before
     for suffix in (".bt", ".ot"):
-        bench.ros.spin_until(lambda: bench.node.idle, 10.0, "all images are in the map")
+        bench.ros.spin_until(lambda: bench.node.idle, what="all images are in the map")
         bench.call(Empty, "/octomap/reset")
-        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 20.0, "the map is empty")
+        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", what="the map is empty")
         answer = file("load", tmp_path / f"map{suffix}")
         assert (answer.success, answer.outside) == (True, 0)
-        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "occupied", 20.0, "the map is back")
+        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "occupied", what="the map is back")
 
 
 @pytest.mark.requirement("P-05")
@@ -192,7 +192,7 @@ def test_the_robot_and_what_it_holds_are_not_in_the_map(bench) -> None:
     bench.held.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL), marker]))
     bench.show(sheet(tool[2, 3]), lambda: bench.state(near) != "occupied", "the held tray is cut out")
     bench.ros.spin_until(
-        lambda: int(bench.value("overhead_removed/held/left/tray") or 0) > 100, 20.0, "its pixels counted"
+        lambda: int(bench.value("overhead_removed/held/left/tray") or 0) > 100, what="its pixels counted"
     )
     bench.held.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL)]))
     bench.show(sheet(tool[2, 3]), lambda: bench.state(near) == "occupied", "it was let go")
@@ -206,12 +206,11 @@ def test_the_distance_field_is_shared_with_version_and_age(bench) -> None:
     assert field.at([ON_TABLE, (0.45, 0.25, 0.61)]) == pytest.approx([0.0, 0.2], abs=1e-6)
     assert field.frame == BASE_FRAME
     field.require_fresh(time.monotonic_ns(), 10.0)
-    bench.ros.spin_until(lambda: reader.latest().t_ns == bench.t_ns, 5.0, "the last image is in the map")
+    bench.ros.spin_until(lambda: reader.latest().t_ns == bench.t_ns, what="the last image is in the map")
     bench.call(Empty, "/octomap/reset")
     bench.ros.spin_until(
         lambda: reader.latest().version > field.version and reader.latest().at([ON_TABLE])[0] > 0.39,
-        5.0,
-        "a newer field",
+        what="a newer field",
     )
     bench.node.close()
     assert not bench.field.exists()
@@ -239,7 +238,7 @@ def test_clouds_are_a_second_input(ros, tmp_path) -> None:
         clouds.publish(cloud_from_points(points, FRAME, bench.t_ns))
         return bench.state(ON_TABLE) == "occupied"
 
-    ros.spin_until(step, 20.0, "the point is in the map")
+    ros.spin_until(step, what="the point is in the map")
     assert bench.state(ABOVE) in ("free", "unknown")
 
 
@@ -312,7 +311,7 @@ def test_a_map_to_start_from_is_published_and_a_damaged_one_refused(ros, tmp_pat
     """And leaves no shared memory behind."""
     reference = Path(__file__).parents[1] / "openarm_octomap" / "data" / "reference.bt"
     bench = Bench(ros, tmp_path, map_file=str(reference))
-    bench.ros.spin_until(lambda: bench.maps, 10.0, "the map of the file")
+    bench.ros.spin_until(lambda: bench.maps, what="the map of the file")
     assert len(bench.maps[0].data) > 1000
     damaged = tmp_path / "damaged.bt"
     damaged.write_bytes(reference.read_bytes()[:2000])

@@ -44,12 +44,12 @@ def test_a_second_ctrl_c_is_the_emergency_stop(ros, tmp_path: Path) -> None:
     with printed.open("w") as output:
         command = subprocess.Popen(words, stdout=output, stderr=output)
     try:
-        ros.spin_until(lambda: "LIFT" in printed.read_text(), 30.0, "the state")
+        ros.spin_until(lambda: "LIFT" in printed.read_text(), what="the state")
         command.send_signal(signal.SIGINT)
-        ros.spin_until(lambda: "cancel" in asked, 10.0, "the cancel")  # sent again where the answer takes long
+        ros.spin_until(lambda: "cancel" in asked, what="the cancel")  # sent again where the answer takes long
         command.send_signal(signal.SIGINT)
         ended = time.monotonic()
-        ros.spin_until(lambda: command.poll() is not None, 10.0, "the end of the command")
+        ros.spin_until(lambda: command.poll() is not None, what="the end of the command")
         assert time.monotonic() - ended < 5.0
         assert list(dict.fromkeys(asked)) == ["cancel", "stop"]
         assert "openarm: STOPPED: emergency stop: the arms hold" in printed.read_text()

@@ -53,7 +53,7 @@ def test_what_was_recorded_can_be_read(
     env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     process = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True, preexec_fn=limit)
     try:
-        ros.spin_until(images.get_subscription_count, 30.0, "the recorder subscribes")
+        ros.spin_until(images.get_subscription_count, what="the recorder subscribes")
         file = tmp_path / "bag" / "bag.mcap"
         for i in range(1000):
             images.publish(array_to_image(noise, "rgb8", "optical", i))
@@ -62,7 +62,7 @@ def test_what_was_recorded_can_be_read(
                 break
         if ending:
             process.send_signal(ending)
-        out, _ = process.communicate(timeout=20.0)
+        out, _ = process.communicate(timeout=60.0)
         assert process.returncode == exit_code
     finally:
         process.kill()
@@ -142,7 +142,7 @@ def test_what_comes_while_the_recorder_is_held_up_is_not_lost(tmp_path: Path) ->
             print(file=sender.stdin, flush=True)
             assert sender.stdout.readline() == "taken\n"
             recorder.send_signal(signal.SIGINT)
-            out, _ = recorder.communicate(timeout=20.0)
+            out, _ = recorder.communicate(timeout=60.0)
         finally:
             recorder.kill()
             sender.kill()

@@ -74,7 +74,7 @@ class Bench:
         self.watch = ros.node.create_subscription(kind, topic, self.got.append, qos)
         self.heard = ros.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_said, reliable(10))
         self.t_ns = 1_000 * MS
-        ros.spin_until(self.images["depth/image_raw"].get_subscription_count, 10.0, "the camera is listened to")
+        ros.spin_until(self.images["depth/image_raw"].get_subscription_count, what="the camera is listened to")
 
     def _on_said(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -105,7 +105,7 @@ class Bench:
                 self.images["depth/camera_info"].publish(info_from_intrinsics(K, FRAME, self.t_ns))
             return bool(condition())
 
-        self.ros.spin_until(step, 15.0, what)
+        self.ros.spin_until(step, what=what)
 
 
 def detector(ros, **params) -> Bench:

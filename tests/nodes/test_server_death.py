@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import pytest
 from control_msgs.action import FollowJointTrajectory
@@ -19,14 +19,13 @@ from std_srvs.srv import Trigger
 from openarm_bringup.supervision.ros.readiness import ReadinessClient
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros import actions
 from openarm_common.ros.actions import ActionClient
 from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.node import BaseNode
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.ros.graph_clients import GraphClients
-
-pytestmark = pytest.mark.alone
 
 NAME = "/wait"
 #: An arm that comes to rest at once is never further from there, rad.
@@ -83,8 +82,8 @@ goal_id = lambda: UUID(uuid=list(os.urandom(16)))
 controller = Controller(node, "/right_joint_trajectory_controller/follow_joint_trajectory", goal_id)
 here, there = (np.array([float(x) for x in part.split(",")]) for part in sys.argv[1:])
 names = tuple(f"openarm_right_joint{i}" for i in range(1, 8))
-t = np.array([0.0, 0.3, 2.7, 3.0])
-speed = (there - here) / 2.7
+t = np.array([0.0, 0.3, 5.7, 6.0])
+speed = (there - here) / 5.7
 q = np.array([here, here + 0.15 * speed, there - 0.15 * speed, there])
 v = np.array([0.0 * speed, speed, speed, 0.0 * speed])
 while not controller.ready():
@@ -117,55 +116,69 @@ def children() -> Iterator[Children]:
     made.end()
 
 
-def killed(process: subprocess.Popen[bytes], number: signal.Signals) -> float:
-    """Send a signal; returns when, monotonic s."""
-    process.send_signal(number)
-    return time.monotonic()
+def begun(pool: ThreadPoolExecutor, client: BackgroundNode) -> Future:
+    """Send a goal, and wait until it runs."""
+    running, goal = threading.Event(), FollowJointTrajectory.Goal()
+    work = pool.submit(client.do, FollowJointTrajectory, NAME, goal, timeout=120.0, on_feedback=lambda _: running.set())
+    assert running.wait(120.0)
+    return work
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who has stopped is not dead before a test has looked at it."""
+    monkeypatch.setattr(actions, "_SILENT_S", 60.0)
 
 
 @pytest.mark.requirement("R-21")
 def test_a_client_ends_when_its_server_is_stopped_or_killed_and_works_with_the_next(ros, children) -> None:
     with ThreadPoolExecutor() as pool, BackgroundNode("client") as client:
-        for number, limit in ((signal.SIGSTOP, 5.0), (signal.SIGKILL, 2.0)):
+        for number in (signal.SIGSTOP, signal.SIGKILL):
             server = children.start(SERVER)  # the one before is still in discovery, and does not answer
-            running = threading.Event()
-            deliver = lambda _, running=running: running.set()  # noqa: E731
-            goal = FollowJointTrajectory.Goal()
-            work = pool.submit(client.do, FollowJointTrajectory, NAME, goal, timeout=60.0, on_feedback=deliver)
-            assert running.wait(120.0)
+            work = begun(pool, client)
             ros.spin_until(lambda: "waiter" in client._node.get_node_names(), 60.0, "the name of the node")
-            began = killed(server, number)
+            server.send_signal(number)
             with pytest.raises(OpenArmError, match="/wait: the node waiter is gone") as caught:
-                work.result(20.0)
-            assert time.monotonic() - began < limit
+                work.result(60.0)
             assert caught.value.code is Code.NOT_READY
 
 
 @pytest.mark.requirement("R-21")
-def test_a_server_that_halts_for_a_while_is_not_dead_and_one_that_is_killed_then_is(ros, children) -> None:
+def test_a_server_that_halts_for_a_while_is_not_dead_and_one_that_is_killed_then_is(ros, children, patient) -> None:
     with ThreadPoolExecutor() as pool, BackgroundNode("client") as client:
-        server, running = children.start(SERVER), threading.Event()
-        goal, deliver = FollowJointTrajectory.Goal(), lambda _: running.set()
-        work = pool.submit(client.do, FollowJointTrajectory, NAME, goal, timeout=60.0, on_feedback=deliver)
-        assert running.wait(120.0)
+        server = children.start(SERVER)
+        work = begun(pool, client)
         watched = client._clients[NAME]._watch
         ros.spin_until(lambda: watched.alive == 1, 60.0, "a sign of life")
         for halts in range(2):
             server.send_signal(signal.SIGSTOP)
-            ros.spin_until(lambda: watched.alive == 0, 10.0, "silence")
+            ros.spin_until(lambda: watched.alive == 0, what="silence")
             assert watched.silence > 0.0
             assert not work.done()
             if not halts:
                 server.send_signal(signal.SIGCONT)
-                ros.spin_until(lambda: watched.alive == 1, 10.0, "a sign of life again")
+                ros.spin_until(lambda: watched.alive == 1, what="a sign of life again")
                 assert watched.silence == 0.0
-        began = killed(server, signal.SIGKILL)
+        server.kill()
         with pytest.raises(OpenArmError, match=r"/wait: the .* is gone"):
-            work.result(20.0)
-        assert time.monotonic() - began < 2.0
+            work.result(60.0)
 
 
-def test_the_probe_of_a_supervisor_knows_who_is_silent_and_when_it_is_deaf_itself(ros, children) -> None:
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.requirement("R-21")
+def test_a_client_notices_the_death_of_its_server_within_two_seconds(children) -> None:
+    with ThreadPoolExecutor() as pool, BackgroundNode("client") as client:
+        server = children.start(SERVER)
+        work = begun(pool, client)
+        server.kill()
+        killed = time.monotonic()
+        with pytest.raises(OpenArmError, match="is gone"):
+            work.result(60.0)
+        assert time.monotonic() - killed < 2.0
+
+
+def test_the_probe_of_a_supervisor_knows_who_is_silent_and_when_it_is_deaf_itself(ros, children, patient) -> None:
     environ = {name: os.environ[name] for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
     with ReadinessClient(environ) as probe:
         one, two = (children.start(SERVICE.replace("waiter", name)) for name in ("one", "two"))
@@ -179,12 +192,12 @@ def test_the_probe_of_a_supervisor_knows_who_is_silent_and_when_it_is_deaf_itsel
 
         ros.spin_until(lambda: alive() == [1, 1], 60.0, "two nodes that live")
         one.send_signal(signal.SIGSTOP)
-        ros.spin_until(lambda: silent() == [True, False], 20.0, "the silence of the first")
+        ros.spin_until(lambda: silent() == [True, False], what="the silence of the first")
         two.send_signal(signal.SIGSTOP)
-        ros.spin_until(lambda: alive() == [0, 0], 20.0, "the silence of both")
+        ros.spin_until(lambda: alive() == [0, 0], what="the silence of both")
         assert silent() == [False, False]
         one.send_signal(signal.SIGCONT)
-        ros.spin_until(lambda: silent() == [False, True], 20.0, "the silence of the second")
+        ros.spin_until(lambda: silent() == [False, True], what="the silence of the second")
 
 
 @pytest.mark.requirement("R-21")
@@ -198,10 +211,9 @@ def test_a_call_of_a_service_ends_when_its_node_is_killed(ros, children, undisco
         ros.spin_until(
             lambda: any(watch.alive for watch in client._watches.values()), 120.0, "a call to a node that lives"
         )
-        began = killed(server, signal.SIGKILL)
+        server.kill()
         with pytest.raises(OpenArmError, match="/wait: the node waiter is gone") as caught:
-            work.result(20.0)
-        assert time.monotonic() - began < 2.0
+            work.result(60.0)
         assert caught.value.code is Code.NOT_READY
         assert not client._clients[NAME]._pending_requests, "what has no answer is no longer waited for"
 
@@ -225,28 +237,41 @@ def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> 
             errors.append(error)
 
     ros.executor.create_task(transfer)
-    ros.spin_until(lambda: client._goal_handles, 20.0, "a goal that runs")
-    began = killed(server, signal.SIGKILL)
-    ros.spin_until(lambda: errors, 20.0, "the end")
-    assert time.monotonic() - began < 2.0
+    ros.spin_until(lambda: client._goal_handles, what="a goal that runs")
+    server.kill()
+    ros.spin_until(lambda: errors, what="the end")
     assert errors[0].code is Code.ROBOT_LOST
     assert "right arm: transfer: the node waiter is gone" in errors[0].message
     assert not client.server_is_ready()
     client.destroy()
 
 
-@pytest.mark.requirement("R-21")
-def test_an_arm_holds_when_the_process_is_killed_that_sent_its_trajectory(bench, children) -> None:
+def holds_after(bench, children) -> float:
+    """Kill the process that sent a trajectory; returns the simulated time until the arm rests, short of its end, s."""
     there = [bench.HOME[0] + 2.0, *bench.HOME[1:]]
     owner = children.start(OWNER, ",".join(map(str, bench.arm)), ",".join(map(str, there)))
     column = bench.joints[-1].name.index(bench.ARM[0])
-    bench.ros.spin_until(lambda: bench.joints[-1].velocity[column] > 0.5, 120.0, "the arm to move")
+    bench.ros.spin_until(lambda: bench.joints[-1].velocity[column] > 0.25, 120.0, "the arm to move")
     bench.spin_sim(0.3)
     owner.kill()
     killed_ns = bench.node._simulation.robot.state.t_ns
-    bench.spin_sim(1.0)
+    rests = lambda: abs(bench.joints[-1].velocity[column]) < 0.01  # noqa: E731
+    bench.ros.spin_until(rests, what="the arm to rest")
+    bench.spin_sim(0.5)
     after = [m for m in bench.joints if stamp_to_ns(m.header.stamp) > killed_ns]
     place = after[-1].position[column]
     assert place < there[0] - 0.3, "it does not arrive"
     moving = [stamp_to_ns(m.header.stamp) for m in after if abs(m.position[column] - place) > RINGING]
-    assert max(moving, default=killed_ns) - killed_ns < 0.3e9, "0.2 s on a machine that is not busy"
+    return (max(moving, default=killed_ns) - killed_ns) * 1e-9
+
+
+@pytest.mark.requirement("R-21")
+def test_an_arm_holds_when_the_process_is_killed_that_sent_its_trajectory(bench, children) -> None:
+    holds_after(bench, children)
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.requirement("R-21")
+def test_an_arm_holds_at_once_when_the_process_is_killed_that_sent_its_trajectory(bench, children) -> None:
+    assert holds_after(bench, children) < 0.3  # 0.2 s on a machine that is not busy

@@ -91,7 +91,7 @@ class Bench:
                     image.publish(array_to_image(self.images[camera.name], "rgb8", camera.optical_frame, t_ns))
             return condition()
 
-        self.ros.spin_until(step, 15.0, what)
+        self.ros.spin_until(step, what=what)
 
 
 @pytest.mark.requirement("R-05")
@@ -133,12 +133,12 @@ def test_a_pair_without_a_baseline_is_refused_with_the_reason_until_it_has_one(r
 def test_it_listens_only_while_its_depth_is_wanted(ros) -> None:
     bench = Bench(ros)
     image, _ = bench.publishers["head_left"]
-    ros.spin_until(lambda: "idle: no subscribers" in bench.reports, 10.0, "a report")
+    ros.spin_until(lambda: "idle: no subscribers" in bench.reports, what="a report")
     assert image.get_subscription_count() == 0
     wanted = ros.node.create_subscription(Image, "/head_left/depth/image_raw", lambda _: None, QOS_SENSOR)
-    ros.spin_until(lambda: image.get_subscription_count() == 1, 10.0, "a subscription")
+    ros.spin_until(lambda: image.get_subscription_count() == 1, what="a subscription")
     ros.node.destroy_subscription(wanted)
-    ros.spin_until(lambda: image.get_subscription_count() == 0, 10.0, "its end")
+    ros.spin_until(lambda: image.get_subscription_count() == 0, what="its end")
 
 
 def test_a_camera_that_is_no_left_one_is_refused_with_those_that_are(ros) -> None:

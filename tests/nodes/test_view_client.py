@@ -31,7 +31,7 @@ class Looking:
     def _take(self, item) -> None:
         self.seen[item.key] = item.payload
 
-    def wait(self, key: str, fits: Callable[[Any], object] = bool, seconds: float = 10.0) -> Any:
+    def wait(self, key: str, fits: Callable[[Any], object] = bool, seconds: float = 30.0) -> Any:
         """The newest payload of a key, once it fits."""
         self.ros.spin_until(lambda: self.ended or (key in self.seen and fits(self.seen[key])), seconds, key)
         assert not self.ended, self.ended
@@ -48,7 +48,7 @@ def looking(ros):
 @pytest.fixture
 def patient(ros):
     """A view that gives servers time to be discovered."""
-    made = Looking(ros, timeout=10.0)
+    made = Looking(ros, timeout=30.0)
     with made.view:
         yield made
 
@@ -86,7 +86,7 @@ def begin(question: Callable[[], Any]) -> list[Any]:
 def ask(ros, question: Callable[[], Any]) -> Any:
     """The answer to a question, or the error in its place."""
     ended = begin(question)
-    ros.spin_until(lambda: ended, 20.0, "an answer")
+    ros.spin_until(lambda: ended, what="an answer")
     return ended[0]
 
 
@@ -122,9 +122,9 @@ def test_a_cloud_is_made_of_depth_and_colour_of_one_stamp(ros, looking: Looking)
 
     ros.node.create_timer(0.1, publish)
     looking.view.want(frozenset({"cloud"}))
-    ros.spin_until(lambda: outs["depth/image_raw"].get_subscription_count(), 10.0, "the page listens")
+    ros.spin_until(lambda: outs["depth/image_raw"].get_subscription_count(), what="the page listens")
     begun = t_ns
-    ros.spin_until(lambda: t_ns > begun + 800_000_000, 10.0, "frames whose halves do not fit")
+    ros.spin_until(lambda: t_ns > begun + 800_000_000, what="frames whose halves do not fit")
     assert "cloud" not in looking.seen
     lag = 0
     data = looking.wait("cloud")
@@ -139,7 +139,7 @@ def test_a_cloud_is_made_of_depth_and_colour_of_one_stamp(ros, looking: Looking)
     assert (colors == (0, 0, 255)).all()
 
     looking.view.want(frozenset())
-    ros.spin_until(lambda: not outs["depth/image_raw"].get_subscription_count(), 10.0, "the page looks away")
+    ros.spin_until(lambda: not outs["depth/image_raw"].get_subscription_count(), what="the page looks away")
 
 
 def test_what_hangs_on_a_link_and_the_way_of_a_plan_are_shown(ros, looking: Looking) -> None:
@@ -160,7 +160,7 @@ def test_what_hangs_on_a_link_and_the_way_of_a_plan_are_shown(ros, looking: Look
     looking.view.want(frozenset({"robot", "plan"}))
     shown = json.loads(looking.wait("held"))["boxes"][0]
     assert (shown["label"], shown["link"], shown["size"]) == ("red", "openarm_left_hand_tcp", [0.05, 0.05, 0.05])
-    ros.spin_until(joints.get_subscription_count, 10.0, "the page listens")
+    ros.spin_until(joints.get_subscription_count, what="the page listens")
     looking.wait("fault:robot", lambda text: "nothing on /joint_states" in text)
     message = JointState(name=["openarm_left_joint1"], position=[0.3])
     ros.node.create_timer(0.05, lambda: joints.publish(message))
@@ -213,7 +213,7 @@ def test_the_plan_that_waits_is_shown_in_place_of_newer_ones_and_answered(ros, l
         )
     )
     thread.start()
-    ros.spin_until(lambda: not thread.is_alive(), 20.0, "the answers")
+    ros.spin_until(lambda: not thread.is_alive(), what="the answers")
     assert (replies, answers) == ([(True, "heard"), (False, "heard")], [("4adc", True), ("4adc", False)])
 
 
@@ -275,7 +275,7 @@ def test_what_fails_in_the_thread_of_the_client_is_said_and_does_not_end_it(ros,
 
     client = patient.view._ask
     client._executor.create_task(fail)
-    ros.spin_until(is_said, 10.0, "a line of the log")
+    ros.spin_until(is_said, what="a line of the log")
     assert "what arrived could not be handled, the rest goes on: RuntimeError" in said
     assert ask(ros, lambda: patient.view.reset(Reset(seed=3))) == (True, "heard")
     assert client._thread.is_alive()
@@ -296,7 +296,7 @@ def test_stop_and_cancel_are_answered_while_another_request_is_stuck(ros, patien
 
     view._ask._executor.create_task(stick)
     try:
-        ros.spin_until(stuck.is_set, 10.0, "a client that is stuck")
+        ros.spin_until(stuck.is_set, what="a client that is stuck")
         reset = begin(lambda: view.reset(Reset(seed=3)))
         for question, answer in ((view.stop, (True, "heard")), (view.cancel, cancelled)):
             began = time.monotonic()
@@ -305,7 +305,7 @@ def test_stop_and_cancel_are_answered_while_another_request_is_stuck(ros, patien
         assert not reset, "the other client was not stuck"
     finally:
         go_on.set()
-    ros.spin_until(lambda: reset, 20.0, "an answer")
+    ros.spin_until(lambda: reset, what="an answer")
     assert reset == [(True, "heard")]
 
 
@@ -315,7 +315,7 @@ def test_a_layer_that_can_t_be_made_ends_the_view_with_its_error(ros, looking: L
 
     monkeypatch.setitem(looking.view._makers, "robot", fail)
     looking.view.want(frozenset({"robot"}))
-    ros.spin_until(lambda: looking.ended, 10.0, "the end of the view")
+    ros.spin_until(lambda: looking.ended, what="the end of the view")
     assert [repr(error) for error in looking.ended] == ["RuntimeError('a fault of the test')"]
 
 
@@ -342,7 +342,7 @@ def test_a_request_whose_client_ends_says_why(ros, end: Callable[[BackgroundNode
     ros.node.create_service(Trigger, "/slow", answer)
     with BackgroundNode("client") as client:
         ended = begin(lambda: client.call(Trigger, "/slow", Trigger.Request()))
-        ros.spin_until(lambda: asked, 20.0, "the request")
+        ros.spin_until(lambda: asked, what="the request")
         end(client)
-        ros.spin_until(lambda: ended, 10.0, "the end of the request")
+        ros.spin_until(lambda: ended, what="the end of the request")
     assert (ended[0].code, ended[0].message) == (Code.NOT_READY, f"the client ended while waiting for /slow: {why}")

@@ -211,7 +211,7 @@ def test_a_graph_that_the_network_can_command_is_noted() -> None:
     assert "move the arms, without a password" in found.advice
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.requirement("B-10")
 def test_doctor_of_this_machine_checks_ros_simulator_and_planner(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -96,6 +96,12 @@ def _unfinished(path: Path, count: int) -> Path:
     return path
 
 
+def test_an_unfinished_chunk_of_many_messages_is_mended(tmp_path: Path) -> None:
+    with open_bag(_unfinished(tmp_path / "bag", 10_000)) as bag:
+        assert bag.counts == {"/chatter": 10_000}
+
+
+@pytest.mark.long
 def test_an_unfinished_chunk_of_many_messages_is_mended_in_linear_time(tmp_path: Path) -> None:
     """Four times the messages take four times as long, not sixteen times; the better of two, of this process alone."""
 

@@ -38,12 +38,12 @@ def test_it_prints_an_address_that_opens_and_ends_with_ctrl_c(tmp_path: Path) ->
     try:
         printed = re.search(r"the page is at (http://127\.0\.0\.1:(\d+)/)#([\w-]{32})$", first.stderr.readline())
         assert printed is not None
-        with urllib.request.urlopen(printed[1], timeout=10.0) as page:
+        with urllib.request.urlopen(printed[1], timeout=60.0) as page:
             shown = page.read().decode()
         assert "<title>OpenArm</title>" in shown
         assert printed[3] not in shown
         with pytest.raises(urllib.error.HTTPError, match="403"):
-            urllib.request.urlopen(urllib.request.Request(f"{printed[1]}stop", method="POST"), timeout=10.0)
+            urllib.request.urlopen(urllib.request.Request(f"{printed[1]}stop", method="POST"), timeout=60.0)
 
         second = start(printed[2], tmp_path)
         said = second.communicate(timeout=60.0)[1]
@@ -52,4 +52,4 @@ def test_it_prints_an_address_that_opens_and_ends_with_ctrl_c(tmp_path: Path) ->
         assert "--port" in said
     finally:
         first.send_signal(signal.SIGINT)
-        assert first.wait(timeout=30.0) == 0
+        assert first.wait(timeout=60.0) == 0

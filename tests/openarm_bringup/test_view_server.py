@@ -22,6 +22,7 @@ from openarm_bringup.view.gate import listening
 from openarm_bringup.view.guard import Guard
 from openarm_bringup.view.server import PAGE, Confirmation, Item, Order, Reset, ViewServer
 from openarm_common.errors import Code, OpenArmError
+from tests.conftest import DEADLINE_S
 
 
 @dataclass
@@ -38,7 +39,7 @@ class Graph:
 
     def pick(self, order: Order) -> dict[str, Any]:
         self.asked.append(order)
-        self.go_on.wait(10.0)
+        self.go_on.wait(60.0)
         return {"success": True, "code": "OK", "message": "placed"}
 
     def confirm(self, answer: Confirmation) -> tuple[bool, str]:
@@ -104,13 +105,13 @@ async def serving(host: str = "127.0.0.1") -> AsyncIterator[Bench]:
 def with_bench(test: Callable[[Bench], Awaitable[None]]) -> None:
     async def main() -> None:
         async with serving() as bench:
-            await asyncio.wait_for(test(bench), 20.0)
+            await asyncio.wait_for(test(bench), 120.0)
 
     asyncio.run(main())
 
 
 async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(10.0):
+    async with asyncio.timeout(DEADLINE_S):
         while not condition():
             await asyncio.sleep(0.01)
 
@@ -289,7 +290,7 @@ def test_a_pick_is_asked_once_at_a_time_and_its_outcome_is_shown() -> None:
         assert (status, answer["code"]) == (409, "BUSY")
         bench.graph.go_on.set()
         async with bench.socket() as socket:
-            async with asyncio.timeout(10.0):
+            async with asyncio.timeout(DEADLINE_S):
                 while (message := await socket.receive_json()).get("running", True):
                     pass
             assert message == {"kind": "outcome", "running": False, "success": True, "code": "OK", "message": "placed"}
@@ -399,7 +400,7 @@ def test_no_malformed_request_keeps_others_from_their_answer() -> None:
 
 def test_requests_that_wait_hold_up_neither_cancel_nor_stop() -> None:
     async def test(bench: Bench) -> None:
-        bench.graph.reset = lambda order: (bench.graph.go_on.wait(10.0), "late")  # type: ignore[method-assign]
+        bench.graph.reset = lambda order: (bench.graph.go_on.wait(60.0), "late")  # type: ignore[method-assign]
         waiting = [asyncio.create_task(bench.post("/reset", {})) for _ in range(40)]
         await until(lambda: sum(task.done() for task in waiting) == 38)
         assert {task.result()[0] for task in waiting if task.done()} == {409}
@@ -460,7 +461,7 @@ def test_connections_that_ask_nothing_keep_no_one_out(monkeypatch: pytest.Monkey
         assert (await bench.post("/stop", {}))[0] == 200
         async with bench.socket() as socket:
             assert json.loads((await socket.receive()).data)["kind"] == "hello"
-            async with asyncio.timeout(10.0):
+            async with asyncio.timeout(DEADLINE_S):
                 for reader, writer in idle:
                     with contextlib.suppress(ConnectionError):
                         while await reader.read(4096):

@@ -200,6 +200,7 @@ def test_of_several_that_were_lifted_the_one_at_the_place_is_judged(tmp_path) ->
     assert run._trial("anything", nowhere, (), 0.0).target != placed
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-01")
 def test_heavy_soft_late_arms_with_wrong_zeros_are_identified_and_place_an_object(tmp_path) -> None:
     options = CampaignOptions(seeds=(0,), noise=True, profile="openarm", dynamics_seeds=(41,))
@@ -263,6 +264,7 @@ def test_an_object_is_picked_by_the_tag_on_it(tmp_path) -> None:
 QUICK = SimulatedSenses(depth_noise=False, sets=("octomap.period=2.0", "grasp.limits.max_attempts=2"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.requirement("N-03", "N-05")
 def test_every_kind_of_fault_ends_with_a_recovery_or_the_right_code(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -285,6 +287,7 @@ def test_every_kind_of_fault_ends_with_a_recovery_or_the_right_code(kind: str, m
     assert found["attempts"] == 2 or not kind.startswith(("nudged", "gripper_stuck_once"))
 
 
+@pytest.mark.long
 @pytest.mark.requirement("N-02", "N-24")
 def test_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_path) -> None:
     task = replace(make_task("nominal", 10000), labels=("yellow",), codes=(Code.GRASP_MISSED, Code.GRASP_LOST))

@@ -13,6 +13,7 @@ from openarm_evaluation.campaign.cluster import pack, unpack
 from openarm_evaluation.campaign.options import CampaignOptions
 
 ray = pytest.importorskip("ray", reason="needs Ray: install the extra `cluster`")
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture(scope="module")

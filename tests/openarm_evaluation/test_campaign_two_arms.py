@@ -20,14 +20,14 @@ from openarm_motion.service.requests import ExecuteRequest, MotionAnswer
 from openarm_motion.timing.trajectory import Motion
 
 
-def run(set_name: str, seed: int):
+def judged(set_name: str, seed: int):
     trials = Trials(make_task(set_name, seed), SimulatedSenses(depth_noise=False), GraspConfig())
     return trials, trials.run()
 
 
 @pytest.mark.requirement("P-12")
 def test_an_object_changes_hands_in_the_middle_and_stands_where_one_arm_alone_cannot_put_it() -> None:
-    trials, row = run("handover", 5000)
+    trials, row = judged("handover", 5000)
     assert row["as_expected"], row["message"]
     assert row["grasps"][0]["route"] == "hand_over"
     arms = [step.arm for step in trials.steps if step.state == "LIFT"]
@@ -37,7 +37,7 @@ def test_an_object_changes_hands_in_the_middle_and_stands_where_one_arm_alone_ca
 
 @pytest.mark.requirement("N-13", "A-65")
 def test_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped() -> None:
-    trials, row = run("push", 5000)
+    trials, row = judged("push", 5000)
     assert row["as_expected"], row["message"]
     assert row["grasps"][0]["route"] == "push"
     reasons = [step.reason for step in trials.steps if step.reason.startswith("push 1 by the")]
@@ -48,7 +48,7 @@ def test_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped() -> None:
 
 @pytest.mark.requirement("A-65")
 def test_two_objects_are_grasped_at_once_and_the_arms_keep_apart() -> None:
-    trials, row = run("pairs", 5001)
+    trials, row = judged("pairs", 5001)
     assert row["as_expected"], row["message"]
     assert row["arm_clearance_mm"] >= 1e3 * LEAST_CLEARANCE
     assert {g["arm"] for g in row["grasps"]} == {"left", "right"}

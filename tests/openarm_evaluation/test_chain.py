@@ -36,6 +36,7 @@ def test_with_calibration_and_map_the_box_is_placed_within_5_mm_and_the_screen_i
     assert pushed < 0.001
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-01")
 def test_without_calibration_the_grasp_fails_and_says_so() -> None:
     row, _ = grasp(calibrated=False)
@@ -44,6 +45,7 @@ def test_without_calibration_the_grasp_fails_and_says_so() -> None:
     assert row["reasons"]  # of the judge: never lifted, dropped, or tilted, by where the fingers happen to touch it
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-01")
 def test_without_the_map_the_arm_runs_into_the_screen() -> None:
     row, pushed = grasp("motion.map.use=off")

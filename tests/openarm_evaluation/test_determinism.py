@@ -10,7 +10,7 @@ import pytest
 from benchmarks.determinism import Run, run_in_new_process
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.requirement("N-18")
 def test_the_same_seed_is_the_same_run_to_the_last_bit_also_next_to_a_busy_process() -> None:
     first = run(3)

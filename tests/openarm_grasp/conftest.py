@@ -1,15 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of the strategies share: a scripted robot."""
+"""What the tests of the strategies share: a scripted robot, and one that was recorded or is simulated."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from openarm_common.detection import Detection
+from tests.openarm_grasp.recorded import Recordings
 from tests.openarm_grasp.scripted import World, standing
+
+#: A test with a robot of `recorded` runs on its recording, and in the long suite in simulation.
+_ROBOTS = ("replayed", pytest.param("simulated", marks=pytest.mark.long))
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "recorded" in metafunc.fixturenames:
+        metafunc.parametrize("recorded", _ROBOTS, indirect=True)
+
+
+@pytest.fixture
+def recorded(request: pytest.FixtureRequest) -> Iterator[Recordings]:
+    """Makes the robot of a test; with --record, a test that passes in simulation writes its recording."""
+    case = [request.node.originalname, *(part for part in request.node.callspec.id.split("-") if part != request.param)]
+    name = re.sub(r"\W+", "_", "-".join(case).removeprefix("test_"))
+    path = Path(__file__).parent / "recordings" / request.path.stem.removeprefix("test_") / name
+    robots = Recordings(path, simulated=request.param == "simulated")
+    failed = request.session.testsfailed
+    yield robots
+    if request.config.getoption("record") and request.session.testsfailed == failed:
+        robots.write()
 
 
 @pytest.fixture

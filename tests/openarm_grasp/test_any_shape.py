@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Things of any shape in simulated physics: found by depth, grasped on their clouds, judged by points and fingers."""
+"""Things of any shape: found by depth, grasped on their clouds, judged by points and fingers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from openarm_common import se3
 from openarm_common.errors import Code
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.scene.scene import Scene, load_scene, parse_scene
-from openarm_evaluation.campaign.in_process_robot import InProcessRobot
 from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
@@ -22,12 +21,11 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict
 from openarm_grasp.perception.detections import Frame, Sighting
 from openarm_grasp.perception.sightings import in_box
-from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from openarm_grasp.sampling.views import views_of
 from openarm_grasp.strategies import find, verify
-from openarm_grasp.strategies.registry import carry_out
 from openarm_grasp.strategies.run import Run
+from tests.openarm_grasp.recorded import Recordings, Requests
 
 
 def alone(name: str, x: float, y: float, yaw: float, side: int = 0) -> Scene:
@@ -37,7 +35,7 @@ def alone(name: str, x: float, y: float, yaw: float, side: int = 0) -> Scene:
     return parse_scene({"name": "alone", "table": table, "objects": [item]}, "alone")
 
 
-@pytest.mark.parametrize(("name", "y"), [("banana", -0.22), ("pear", 0.20)])
+@pytest.mark.parametrize(("name", "y"), [("banana", -0.22), pytest.param("pear", 0.20, marks=pytest.mark.long)])
 def test_what_is_no_prism_is_grasped_on_its_cloud_and_placed(name: str, y: float) -> None:
     senses = SimulatedSenses(depth_noise=True, detector="anything")
     trials = Trials(Task("nominal", 1, alone(name, 0.27, y, 0.4), ("anything",)), senses, GraspConfig())
@@ -60,92 +58,80 @@ def test_images_of_one_camera_are_one_view_and_the_border_of_the_object_is_no_ob
     assert np.allclose(first.others[:, 0], 0.35)
 
 
-def test_what_the_border_cuts_is_placed_when_all_of_it_is_seen_there() -> None:
-    senses = SimulatedSenses(depth_noise=True, detector="anything")
-    scene = alone("cereal_box", 0.22, 0.42, 0.3, side=3)
-    trials = Trials(Task("nominal", 1, scene, ("anything",)), senses, GraspConfig())
-    (grasp,) = trials.run()["grasps"]
-    assert grasp["outcome"] == "placed", grasp["message"]
-    assert "what was seen of it is within" in grasp["message"]
+def test_what_the_border_cuts_is_placed_when_all_of_it_is_seen_there(recorded: Recordings) -> None:
+    outcome = recorded(alone("cereal_box", 0.22, 0.42, 0.3, side=3)).ask("anything")
+    assert outcome.success, outcome.message
+    assert "what was seen of it is within" in outcome.message
 
 
-def test_what_a_hand_keeps_is_judged_by_its_points_where_it_is_placed_later() -> None:
-    senses = SimulatedSenses(depth_noise=True, detector="anything")
-    task = Task("nominal", 1, alone("banana", 0.27, -0.22, 0.4), ("anything",))
-    trials = Trials(task, senses, GraspConfig())
-    trials.robot.pass_time(0.5)
-    for phase in ("pick", "place"):
-        request = GraspRequest("anything" if phase == "pick" else "", phase=phase)
-        outcome = trials.link.run(carry_out(trials.grasp_task(request)))
-        assert outcome.success, outcome.message
+def test_what_a_hand_keeps_is_judged_by_its_points_where_it_is_placed_later(recorded: Recordings) -> None:
+    robot, _ = kept_banana(recorded)
+    outcome = robot.ask(phase="place")
+    assert outcome.success, outcome.message
     assert "the cluster is" in outcome.message
 
 
-def test_where_the_points_of_what_was_placed_are_is_remembered() -> None:
-    senses = SimulatedSenses(depth_noise=True, detector="anything")
-    trials = Trials(Task("nominal", 1, alone("banana", 0.27, -0.22, 0.4), ("anything",)), senses, GraspConfig())
-    trials.robot.pass_time(0.5)
-    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("anything"))))
+def test_where_the_points_of_what_was_placed_are_is_remembered(recorded: Recordings) -> None:
+    robot = recorded(alone("banana", 0.27, -0.22, 0.4))
+    outcome = robot.ask("anything")
     assert outcome.success, outcome.message
     place = tuple(outcome.place_position[:2])
-    near, (points,) = trials.session.parts_of((place,))
+    near, (points,) = robot.session.parts_of((place,))
     assert near == ()
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     assert np.linalg.norm(middle - place) < 0.03
     assert 0.10 < np.linalg.norm(np.ptp(points, axis=0)) < 0.25
     elsewhere = (place[0] + 0.05, place[1])
-    assert trials.session.parts_of((elsewhere,)) == ((elsewhere,), ())
+    assert robot.session.parts_of((elsewhere,)) == ((elsewhere,), ())
 
 
-def kept_banana() -> tuple[Trials, str]:
+def kept_banana(recorded: Recordings) -> tuple[Requests, str]:
     """Pick the banana; returns the arm that holds it."""
-    senses = SimulatedSenses(depth_noise=True, detector="anything")
-    task = Task("nominal", 1, alone("banana", 0.27, -0.22, 0.4), ("anything",))
-    trials = Trials(task, senses, GraspConfig())
-    trials.robot.pass_time(0.5)
-    assert trials.link.run(carry_out(trials.grasp_task(GraspRequest("anything", phase="pick")))).success
-    (arm,) = trials.session.kept
-    return trials, arm
+    robot = recorded(alone("banana", 0.27, -0.22, 0.4))
+    outcome = robot.ask("anything", phase="pick")
+    assert outcome.success, outcome.message
+    (arm,) = robot.session.kept
+    return robot, arm
 
 
 @pytest.mark.parametrize("in_part", [False, True])
-def test_the_map_around_the_hand_is_in_no_way_where_more_than_was_seen_hangs_in_it(monkeypatch, in_part) -> None:
-    trials, arm = kept_banana()
-    kept = trials.session.kept[arm]
-    trials.session.kept[arm] = replace(kept, adjacent=(kept.sighting.target,) if in_part else ())
-    plan, asked = InProcessRobot.plan, list[PlanPlace]()
+def test_the_map_around_the_hand_is_in_no_way_where_more_than_was_seen_hangs_in_it(
+    recorded: Recordings, monkeypatch, in_part
+) -> None:
+    robot, arm = kept_banana(recorded)
+    kept = robot.session.kept[arm]
+    robot.session.kept[arm] = replace(kept, adjacent=(kept.sighting.target,) if in_part else ())
+    plan, asked = robot.link.plan, list[PlanPlace]()
 
-    async def watched(self: InProcessRobot, request: PlanGrasp | PlanPlace) -> Planned:
+    async def watched(request: PlanGrasp | PlanPlace) -> Planned:
         asked.extend([request] if isinstance(request, PlanPlace) else [])
-        return await plan(self, request)
+        return await plan(request)
 
-    monkeypatch.setattr(InProcessRobot, "plan", watched)
-    p_base_tcp = trials.skills.T_base_tcp(arm)[:3, 3]
-    trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    monkeypatch.setattr(robot.link, "plan", watched)
+    p_base_tcp = robot.skills.T_base_tcp(arm)[:3, 3]
+    robot.ask(phase="place")
     regions = [box for box in asked[0].ignore_regions if box.id.endswith("/hanging")]
     assert len(regions) == in_part
     assert all(box.T_frame_box[:3, 3] == pytest.approx(p_base_tcp, abs=0.01) for box in regions)
     assert asked[0].held
 
 
-def test_among_other_things_the_place_is_planned_before_the_lift() -> None:
-    senses = SimulatedSenses(depth_noise=True, detector="anything")
+def test_among_other_things_the_place_is_planned_before_the_lift(recorded: Recordings) -> None:
     items = [
         {"name": name, "shape": "mesh", "object": name, "position": [0.27, y], "yaw": 0.4}
         for name, y in (("banana", -0.20), ("apple", -0.38))
     ]
     table = load_scene("empty").table.model_dump()
     scene = parse_scene({"name": "two", "table": table, "objects": items}, "two")
-    trials = Trials(Task("nominal", 1, scene, ("anything",)), senses, GraspConfig())
-    trials.robot.pass_time(0.5)
-    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest(""))))
+    robot = recorded(scene)
+    outcome = robot.ask()
     assert outcome.success, outcome.message
-    assert any("planning the place" in step.reason for step in trials.steps)
+    assert "planning the place" in robot.said
 
 
-def test_one_image_that_shows_it_at_its_place_is_enough(monkeypatch) -> None:
+def test_one_image_that_shows_it_at_its_place_is_enough(recorded: Recordings, monkeypatch) -> None:
     """The newest of three shows only a part of it, as it may of a thin thing."""
-    trials, _ = kept_banana()
+    robot, _ = kept_banana(recorded)
     seen_in, asked = verify._seen_whole, list[int]()
 
     def in_part(frame: Frame, *args) -> CameraVerdict:
@@ -153,55 +139,57 @@ def test_one_image_that_shows_it_at_its_place_is_enough(monkeypatch) -> None:
         return CameraVerdict(Code.PLACE_FAILED, "in part") if len(asked) == 1 else seen_in(frame, *args)
 
     monkeypatch.setattr(verify, "_seen_whole", in_part)
-    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    outcome = robot.ask(phase="place")
     assert (outcome.success, outcome.attempts, len(asked)) == (True, 1, 2), outcome.message
 
 
-def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_that() -> None:
-    trials, arm = kept_banana()
-    kept = trials.session.kept[arm]
+def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_that(recorded: Recordings) -> None:
+    robot, arm = kept_banana(recorded)
+    kept = robot.session.kept[arm]
     assert not kept.turned
-    trials.session.kept[arm] = replace(kept, turned=True)
-    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    robot.session.kept[arm] = replace(kept, turned=True)
+    outcome = robot.ask(phase="place")
     assert (outcome.success, outcome.attempts) == (True, 2), outcome.message  # it is taken up again from there
-    assert any("it had turned or slipped in the hand" in step.reason for step in trials.steps)
+    assert "it had turned or slipped in the hand" in robot.said
 
 
-def test_what_is_seen_away_from_its_target_is_not_said_to_be_placed() -> None:
-    trials, arm = kept_banana()
-    kept = trials.session.kept[arm]
+def test_what_is_seen_away_from_its_target_is_not_said_to_be_placed(recorded: Recordings) -> None:
+    robot, arm = kept_banana(recorded)
+    kept = robot.session.kept[arm]
     shifted = se3.make(p=(0.0, 0.030, 0.0)) @ kept.candidate.T_base_tcp
-    trials.session.kept[arm] = replace(kept, candidate=replace(kept.candidate, T_base_tcp=shifted))
-    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    robot.session.kept[arm] = replace(kept, candidate=replace(kept.candidate, T_base_tcp=shifted))
+    outcome = robot.ask(phase="place")
     assert outcome.attempts == 2, outcome.message
-    assert any("mm from its target, expected at most 15 mm" in step.reason for step in trials.steps)
+    assert "mm from its target, expected at most 15 mm" in robot.said
 
 
-def test_what_was_seen_in_part_must_be_seen_within_half_of_what_counts_as_moved() -> None:
-    trials, arm = kept_banana()
-    kept = trials.session.kept[arm]
+def test_what_was_seen_in_part_must_be_seen_within_half_of_what_counts_as_moved(recorded: Recordings) -> None:
+    robot, arm = kept_banana(recorded)
+    kept = robot.session.kept[arm]
     part = replace(kept.sighting, target=replace(kept.sighting.target, measured=False))
     shifted = se3.make(p=(0.0, 0.014, 0.0)) @ kept.candidate.T_base_tcp
-    trials.session.kept[arm] = replace(kept, sighting=part, candidate=replace(kept.candidate, T_base_tcp=shifted))
-    trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
-    reasons = " ".join(step.reason for step in trials.steps)
+    robot.session.kept[arm] = replace(kept, sighting=part, candidate=replace(kept.candidate, T_base_tcp=shifted))
+    robot.ask(phase="place")
+    reasons = robot.said
     off = re.search(r"what was seen of it is (\d+) mm from where it was put down, expected at most 6 mm", reasons)
     assert off is not None
     assert int(off[1]) <= 12
 
 
-def test_what_has_gone_with_what_a_hand_keeps_may_be_a_part_of_it() -> None:
-    trials, arm = kept_banana()
-    kept = trials.session.kept[arm]
+def test_what_has_gone_with_what_a_hand_keeps_may_be_a_part_of_it(recorded: Recordings) -> None:
+    robot, arm = kept_banana(recorded)
+    kept = robot.session.kept[arm]
     gone = replace(kept.sighting.target, T_base_object=se3.make(p=(0.27, -0.16, 0.42)), size=np.full(3, 0.03))
-    trials.session.kept[arm] = replace(kept, adjacent=(gone,))
-    outcome = trials.link.run(carry_out(trials.grasp_task(GraspRequest("", phase="place"))))
+    robot.session.kept[arm] = replace(kept, adjacent=(gone,))
+    outcome = robot.ask(phase="place")
     assert outcome.code is Code.PLACE_FAILED
     assert "has gone with it: it is a part of it" in outcome.message
 
 
 @pytest.mark.parametrize("among", [False, True])
-def test_what_was_seen_as_two_things_and_rises_as_one_is_placed_as_one_where_it_was_alone(monkeypatch, among) -> None:
+def test_what_was_seen_as_two_things_and_rises_as_one_is_placed_as_one_where_it_was_alone(
+    recorded: Recordings, monkeypatch, among
+) -> None:
     """One end of the wrench is taken for another thing, in the observation before the grasp alone."""
 
     def split(run: Run, frames: Sequence[Frame]) -> Sighting:
@@ -225,13 +213,11 @@ def test_what_was_seen_as_two_things_and_rises_as_one_is_placed_as_one_where_it_
 
     located = find._locate
     monkeypatch.setattr(find, "_locate", split)
-    senses = SimulatedSenses(depth_noise=True, detector="anything")
-    trials = Trials(Task("nominal", 1, alone("wrench", 0.27, -0.22, 0.4), ("anything",)), senses, GraspConfig())
-    (grasp,) = trials.run()["grasps"]
-    assert grasp["attempts"] == 1, [step.reason for step in trials.steps]
-    assert grasp["placed"]
+    robot = recorded(alone("wrench", 0.27, -0.22, 0.4))
+    outcome = robot.ask("anything")
+    assert outcome.attempts == 1, robot.said
     if among:
-        assert grasp["code"] == "PLACE_FAILED"
-        assert "has gone with it: it may be another thing" in grasp["message"]
+        assert outcome.code is Code.PLACE_FAILED
+        assert "has gone with it: it may be another thing" in outcome.message
     else:
-        assert grasp["code"] == "OK", grasp["message"]
+        assert outcome.code is Code.OK, outcome.message

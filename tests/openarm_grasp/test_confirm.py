@@ -300,6 +300,7 @@ def test_a_push_is_asked_about() -> None:
     assert is_executed(world, *shown)
 
 
+@pytest.mark.long
 def test_the_controllers_get_the_trajectories_that_were_shown_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """On the robot of a campaign: the planner, the motion service and the controllers are the real ones."""
     box = SceneObject(name="box", shape="box", size=(0.045, 0.06, 0.06), color="blue", position=(0.26, -0.2), yaw=0.4)

@@ -96,7 +96,7 @@ def test_arms_that_measured_different_directions_are_not_compared():
     assert not watch.drift().arms
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.requirement("N-06")
 def test_grasps_with_a_mount_8_mm_off_raise_the_alarm() -> None:
     camera = load_cameras()["overhead"]

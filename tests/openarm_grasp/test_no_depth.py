@@ -17,7 +17,7 @@ GRAPH = load_graph("no_depth")
 
 
 @pytest.mark.requirement("B-31")
-@pytest.mark.parametrize("label", ["red", "green"])
+@pytest.mark.parametrize("label", ["red", pytest.param("green", marks=pytest.mark.long)])
 def test_an_object_of_known_height_is_picked_without_depth(label: str) -> None:
     """The second look of the wrist camera is by silhouette too; what each camera locates is within 5 mm."""
     assert GRAPH.nodes.keys() >= {"detector", "wrist_detector", "grasp"}

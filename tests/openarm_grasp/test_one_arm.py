@@ -94,6 +94,7 @@ def test_what_takes_two_arms_is_not_offered(robot: RobotDescription) -> None:
             make_task(suite, 0)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("B-13")
 def test_it_places_an_object_and_looks_with_the_camera_on_its_hand(robot: RobotDescription) -> None:
     item = SceneObject(name="box", shape="box", size=(0.05, 0.06, 0.06), color="red", position=(0.5, 0.15), yaw=0.3)

@@ -13,6 +13,7 @@ from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-04")
 @pytest.mark.parametrize(("side", "y"), [("left", 0.22), ("right", -0.22)])
 def test_it_places_an_object_with_either_hand_and_looks_with_its_camera(

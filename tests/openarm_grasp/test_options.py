@@ -82,6 +82,7 @@ def test_what_could_be_grasped_but_not_placed_says_so_and_those_that_share_its_f
     assert sum(o.code is Code.OK for o in found.values()) == 1
 
 
+@pytest.mark.long
 def test_the_planner_says_what_became_of_each_and_how_near_to_a_limit() -> None:
     """A wall next to the object: hands that lean over it are refused by its name."""
     box = SceneObject(name="red_box", shape="box", size=(0.045, 0.06, 0.06), color="red", position=(0.26, -0.2))

@@ -52,6 +52,7 @@ def hand_target(trials: Trials, status: Status) -> np.ndarray:
     return trials.robot.description.link_pose(trials.robot.description.tcp_link(status.arm), joints)[:2, 3]
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-35")
 def test_the_second_look_removes_the_error_of_the_first() -> None:
     _, _, coarse = grasp(enabled=False, off=(0.009, 0.008))

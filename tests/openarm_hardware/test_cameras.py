@@ -166,7 +166,7 @@ def test_a_camera_that_is_absent_unplugged_or_silent_is_opened_again() -> None:
     feed = CameraFeed(camera, take, silent_s=0.5)
     feed.start()
     try:
-        assert enough.wait(20.0)
+        assert enough.wait(60.0)
         assert feed.device == "scripted"
         assert feed.fault == ""
         assert faults == {""}

@@ -28,7 +28,7 @@ def test_a_pose_in_a_box_is_refused_with_the_pair_and_the_nearest_pose_above(
     assert (caught.value.code, caught.value.stage) == (Code.IN_COLLISION, "goal")
     assert caught.value.contact is not None
     assert caught.value.contact.second == "crate"
-    found = near_pose(right, now, around, pose)
+    found = near_pose(right, now, around, pose, budget=60.0)
     assert found is not None
     np.testing.assert_allclose(found.pose[:3, :3], DOWN, atol=1e-3)
     assert 0.01 < found.distance <= 0.11
@@ -41,7 +41,7 @@ def test_a_pose_out_of_reach_has_the_nearest_in_reach(right: Arm, home: dict[str
     with pytest.raises(PlanFailedError) as caught:
         moves.to_pose(right, now, pose, RequestBoxes())
     assert (caught.value.code, caught.value.stage) == (Code.UNREACHABLE, "goal")
-    found = near_pose(right, now, RequestBoxes(), pose)
+    found = near_pose(right, now, RequestBoxes(), pose, budget=60.0)
     assert found is not None
     assert 0.0 < found.distance < 0.35
 
@@ -56,7 +56,7 @@ def test_joints_in_a_wall_end_before_it(right: Arm, home: dict[str, float]) -> N
     with pytest.raises(PlanFailedError) as caught:
         moves.to_joints(right, now, goal.tolist(), around)
     assert caught.value.stage == "goal"
-    found = near_joints(right, now, around, goal)
+    found = near_joints(right, now, around, goal, budget=60.0)
     assert found is not None
     assert not right.scene(home, around.obstacles).collides(found.q)
     assert found.distance < 0.4

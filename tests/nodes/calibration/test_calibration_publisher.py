@@ -32,7 +32,7 @@ def edges(ros) -> dict[tuple[str, str], np.ndarray]:
     """What a late listener gets."""
     got: list[TFMessage] = []
     ros.node.create_subscription(TFMessage, "/tf_static", got.append, QOS_STATIC_TF)
-    ros.spin_until(lambda: got, 10.0, "/tf_static")
+    ros.spin_until(lambda: got, what="/tf_static")
     assert len(got) == 1
     return {(e.header.frame_id, e.child_frame_id): transform_to_matrix(e.transform) for e in got[0].transforms}
 
@@ -104,15 +104,15 @@ def test_stored_calibrations_are_latched_and_a_change_arrives_without_a_restart(
         edge = [e for e in got[-1].transforms if e.child_frame_id == "wrist_link"] if got else []
         return edge[0].transform.translation.x if edge else 0.0
 
-    ros.spin_until(lambda: wrist() == 0.10, 10.0, "the stored mount")
+    ros.spin_until(lambda: wrist() == 0.10, what="the stored mount")
     path = store.save(stored(0.11, 3))
-    ros.spin_until(lambda: wrist() == 0.11, 10.0, "the new mount")
+    ros.spin_until(lambda: wrist() == 0.11, what="the new mount")
     count = len(got)
     path.write_text("camera: wrist\n")
-    ros.spin_until(lambda: len(got) > count, 10.0, "a message after the damage")
+    ros.spin_until(lambda: len(got) > count, what="a message after the damage")
     assert wrist() == 0.11
     store.rollback("wrist")
-    ros.spin_until(lambda: wrist() == 0.10, 10.0, "the mount before")
+    ros.spin_until(lambda: wrist() == 0.10, what="the mount before")
 
 
 @pytest.mark.requirement("A-32", "R-15")
@@ -123,11 +123,11 @@ def test_the_intrinsics_of_the_calibration_in_use_are_latched_and_taken_back_wit
     got: dict[str, list[CameraInfo]] = {"wrist": [], "overhead": []}
     for name, infos in got.items():
         ros.node.create_subscription(CameraInfo, f"/calibration/{name}/camera_info", infos.append, QOS_LATCHED)
-    ros.spin_until(lambda: all(got.values()), 10.0, "camera infos")
+    ros.spin_until(lambda: all(got.values()), what="camera infos")
     assert intrinsics_from_info(got["wrist"][-1]) == optics
     assert got["overhead"][-1].width == 0, "the mount is nominal"
     store.save(stored(0.11, None))
-    ros.spin_until(lambda: got["wrist"][-1].width == 0, 10.0, "a calibration without intrinsics")
+    ros.spin_until(lambda: got["wrist"][-1].width == 0, what="a calibration without intrinsics")
 
 
 @pytest.mark.parametrize("wrong", [stored(0.2, 1), stored(0.2, None, "openarm_left_link7")])

@@ -59,14 +59,13 @@ def test_servos_are_identified_stored_and_used(ros, bridge) -> None:
     np.testing.assert_allclose(stored.friction, [made.friction[name] for name in names], atol=0.25)
     ros.spin_until(
         lambda: bench.node._face._servos.sources["right"] == f"identified {stored.digest()[:12]}",
-        10.0,
-        "the bridge to use them",
+        what="the bridge to use them",
     )
     assert bench.node._face._servos.sources["left"] == "as configured"
 
 
 def test_ideal_servos_are_not_identified(bench) -> None:
-    bench.ros.spin_until(lambda: bench.joints, 10.0, "joint states")
+    bench.ros.spin_until(lambda: bench.joints, what="joint states")
     with pytest.raises(OpenArmError, match="the servos of the profile `ideal` are known") as caught:
         identify(bench, arm="right")
     assert caught.value.code is Code.INVALID_ARGUMENT

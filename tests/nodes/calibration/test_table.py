@@ -94,16 +94,16 @@ def test_a_table_15_mm_off_is_refused_measured_stored_and_right_for_both_detecto
     done = calibrate()
     assert done.success, done.message
     assert f"before {CONFIGURED:.4f} m" in done.message
-    ros.spin_until(lambda: heights.now == pytest.approx(SEEN, abs=0.0005), 10.0, "the measured height")
+    ros.spin_until(lambda: heights.now == pytest.approx(SEEN, abs=0.0005), what="the measured height")
     for node in (bench.node, wrist):
-        ros.spin_until(lambda node=node: node.table_height == heights.now, 10.0, "it is taken over")
+        ros.spin_until(lambda node=node: node.table_height == heights.now, what="it is taken over")
     (found,) = bench.detect().detections
     assert found.results[0].pose.covariance[0] > 0.0
     assert found.bbox.size.z == pytest.approx(0.05, abs=0.0015)
     block = calibrate(block_height=0.04, label="red")
     assert block.data["height"] == pytest.approx(SEEN + 0.01, abs=0.0015)
     TableStore(default_folder()).rollback(TABLE)
-    ros.spin_until(lambda: heights.now == pytest.approx(SEEN, abs=0.0005), 10.0, "the height before")
+    ros.spin_until(lambda: heights.now == pytest.approx(SEEN, abs=0.0005), what="the height before")
 
 
 @pytest.mark.requirement("B-63")
@@ -117,7 +117,7 @@ def test_a_stored_height_outlives_the_node_and_is_not_taken_for_another_table(ro
     saved = ros.call(client, SaveTable.Request(height=SEEN, std=0.001, method="surface"))
     assert saved.success, saved.message
     assert saved.path == str(TableStore(default_folder()).path(TABLE))
-    ros.spin_until(lambda: heights.now == SEEN, 10.0, "the stored height")
+    ros.spin_until(lambda: heights.now == SEEN, what="the stored height")
     store = TableStore(default_folder())
     assert store.in_use(CONFIGURED, None)[0] == SEEN
     assert store.in_use(0.40 + CONFIGURED, None)[0] == 0.40 + CONFIGURED, "of another scene"

@@ -7,6 +7,7 @@ The fakes speak the real interfaces. Robot time runs five times as fast as the w
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from functools import partial
 
@@ -55,6 +56,7 @@ class FakeGraph(Node):
         scene: Version of the planning scene.
         executed: Trajectories.
         goal_ids: Of motions.
+        step_ns: By which robot time advances at each joint state.
         silent: No joint states any more.
         blind: No detections any more.
     """
@@ -64,7 +66,7 @@ class FakeGraph(Node):
         self._group = ReentrantCallbackGroup()
         self._servers: list[ActionServer] = []
         self.robot = RobotDescription.load()
-        self.t_ns = 5_000_000_000
+        self.t_ns, self.step_ns = 5_000_000_000, STEP_NS
         self.silent = self.blind = False
         self.slips, self.scene = 0, 1
         self.executed: list[JointTrajectory] = []
@@ -105,7 +107,7 @@ class FakeGraph(Node):
     def _publish_states(self) -> None:
         if self.silent:
             return
-        self.t_ns += STEP_NS
+        self.t_ns += self.step_ns
         message = JointState(name=list(self.q), position=list(self.q.values()))
         message.header.stamp = ns_to_stamp(self.t_ns)
         message.effort = [self.efforts.get(name, 0.0) for name in self.q]
@@ -275,7 +277,9 @@ class Bench:
     def __init__(self, ros, **fakes: bool) -> None:
         self.ros = ros
         self.world: FakeGraph = ros.add(FakeGraph(**fakes))
-        self.node: GraspNode = ros.add(GraspNode(parameter_overrides=[Parameter("limits.ready_timeout", value=5.0)]))
+        complete = fakes.get("motion", True) and fakes.get("detector", True)
+        patience = Parameter("limits.ready_timeout", value=60.0 if complete else 5.0)
+        self.node: GraspNode = ros.add(GraspNode(parameter_overrides=[patience]))
         self.status: list[GraspStatus] = []
         self.markers: list[MarkerArray] = []
         probe = ros.node
@@ -286,19 +290,24 @@ class Bench:
         self.confirm = probe.create_client(ConfirmPlan, "/grasp/confirm")
         self.action = ActionClient(probe, Pick, "/grasp/pick")
         self.two = ActionClient(probe, PickTwo, "/grasp/pick_two")
-        ros.spin_until(lambda: self.status, 20.0, "the first status")
+        ros.spin_until(lambda: self.status, what="the first status")
 
-    def ask(self, label: str = "red", timeout: float = 30.0, **request) -> Grasp.Response:
-        return self.ros.call(self.service, Grasp.Request(label=label, **request), timeout)
+    def ask(self, label: str = "red", **request) -> Grasp.Response:
+        return self.ros.call(self.service, Grasp.Request(label=label, **request), 60.0)
 
     def answer(self, plan_id: str, *, accept: bool) -> ConfirmPlan.Response:
-        return self.ros.call(self.confirm, ConfirmPlan.Request(plan_id=plan_id, accept=accept), 20.0)
+        return self.ros.call(self.confirm, ConfirmPlan.Request(plan_id=plan_id, accept=accept))
 
     def states(self) -> list[str]:
         return [s.state for s in self.status]
 
-    def until(self, condition: Callable[[], object], timeout: float = 20.0, what: str = "") -> None:
-        self.ros.spin_until(condition, timeout, what)
+    def until(self, condition: Callable[[], object], *, what: str = "") -> None:
+        self.ros.spin_until(condition, 60.0, what)
+
+
+def silence(message: str) -> float:
+    """How long the robot was silent, by the message of a failure, s; what the node itself was halted is left out."""
+    return float(re.search(r"silent for ([\d.]+) s", message)[1])
 
 
 @pytest.fixture

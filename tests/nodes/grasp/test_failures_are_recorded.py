@@ -32,7 +32,7 @@ def test_a_failure_is_recorded_with_its_reason_and_the_command_for_another_try(b
     bench.world.slips = 99
     request = Grasp.Request(label="red", arm="right", has_place_position=True)
     request.place_position.x, request.place_position.y = 0.25, -0.3
-    answer = bench.ros.call(bench.service, request, 30.0)
+    answer = bench.ros.call(bench.service, request)
     assert (answer.code, answer.recording) == ("GRASP_MISSED", "/recordings/1")
     reason, about, again = asked[0].splitlines()
     assert reason == f"GRASP_MISSED: {answer.message}"

@@ -29,7 +29,7 @@ def test_the_client_picks_from_plain_python(bench):
 
     thread = Thread(target=script)
     thread.start()
-    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    bench.until(lambda: not thread.is_alive(), what="the script ends")
     thread.join()
     assert results[0].success, results[0].message
     assert results[0].raise_for_code() is results[0]
@@ -53,7 +53,7 @@ def test_the_client_picks_and_places_in_two_requests(bench):
 
     thread = Thread(target=script)
     thread.start()
-    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    bench.until(lambda: not thread.is_alive(), what="the script ends")
     thread.join()
     picked, other, placed = results
     assert (picked.outcome, picked.code) == ("SUCCESS", Code.OK), picked.message
@@ -75,7 +75,7 @@ def test_the_client_means_an_object_by_its_position_and_leaves_others(bench):
 
     thread = Thread(target=script)
     thread.start()
-    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    bench.until(lambda: not thread.is_alive(), what="the script ends")
     thread.join()
     intended, left, chosen = results
     assert (intended.success, intended.label) == (True, "blue"), intended.message
@@ -96,7 +96,7 @@ def test_the_client_can_cancel_from_its_feedback(bench):
 
     thread = Thread(target=script)
     thread.start()
-    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    bench.until(lambda: not thread.is_alive(), what="the script ends")
     thread.join()
     assert results[0].code is Code.CANCELLED
 
@@ -116,7 +116,7 @@ def test_what_the_feedback_raises_reaches_the_caller(bench):
 
     thread = Thread(target=script)
     thread.start()
-    bench.until(lambda: not thread.is_alive(), 20.0, "the script ends")
+    bench.until(lambda: not thread.is_alive(), what="the script ends")
     thread.join()
     assert "user's code" in str(errors[0])
 
@@ -139,7 +139,7 @@ def test_the_client_notices_that_the_node_is_gone(bench):
     bench.ros.nodes.remove(bench.node)
     bench.node.close()
     bench.node.destroy_node()
-    bench.until(lambda: not thread.is_alive(), 20.0, "the script ends")
+    bench.until(lambda: not thread.is_alive(), what="the script ends")
     thread.join()
     assert errors[0].code is Code.NOT_READY
 
@@ -169,7 +169,7 @@ def test_a_node_that_starts_with_a_full_hand_names_what_it_holds_and_the_client_
 
     thread = Thread(target=script)
     thread.start()
-    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    bench.until(lambda: not thread.is_alive(), what="the script ends")
     thread.join()
     refused, released, nothing = results
     assert (refused.outcome, refused.code) == ("REFUSED", Code.NOT_READY)

@@ -78,13 +78,13 @@ def test_a_plan_that_is_rejected_cancelled_or_out_of_time_moves_nothing(bench):
     rejected = bench.service.call_async(Grasp.Request(label="red", confirm=True))
     first = waiting(bench)
     assert bench.answer(first.plan_id, accept=False).success
-    assert bench.ros.result(rejected, 20.0).code == "CANCELLED"
+    assert bench.ros.result(rejected).code == "CANCELLED"
     late = bench.service.call_async(Grasp.Request(label="red", confirm=True, timeout=5.0))
-    assert bench.ros.result(late, 30.0).code == "TIMEOUT"
+    assert bench.ros.result(late).code == "TIMEOUT"
     handle, result = bench.ros.send_goal(bench.action, Pick.Goal(label="red", confirm=True))
     waiting(bench, *{status.plan_id for status in bench.status if status.plan_id})
     bench.ros.result(handle.cancel_goal_async())
-    assert bench.ros.result(result, 20.0).result.code == "CANCELLED"
+    assert bench.ros.result(result).result.code == "CANCELLED"
     assert set(bench.world.log) == {"plan right"}
 
 
@@ -118,7 +118,7 @@ def test_the_client_asks_its_caller(bench):
 
     thread = Thread(target=script)
     thread.start()
-    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    bench.until(lambda: not thread.is_alive(), what="the script ends")
     thread.join()
     rejected, placed = results
     assert (rejected.code, rejected.attempts) == (Code.CANCELLED, 0)

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import time
-
 import pytest
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -18,8 +16,9 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_transform
 from openarm_common.ros.node import QOS_LATCHED
+from openarm_grasp.config import BudgetConfig
 from openarm_grasp.ros.node import GraspNode
-from tests.nodes.grasp.conftest import FakeGraph
+from tests.nodes.grasp.conftest import FakeGraph, silence
 
 OPEN = 0.044
 
@@ -47,7 +46,7 @@ def test_order_of_hand_and_arm(bench):
     near: list[int] = []
     holds: list[DiagnosticStatus] = []
     bench.ros.node.create_subscription(DiagnosticStatus, "/arm_holds", holds.append, 10)
-    bench.until(lambda: bench.ros.node.count_publishers("/arm_holds"), 20.0, "the holder")
+    bench.until(lambda: bench.ros.node.count_publishers("/arm_holds"), what="the holder")
     bench.world.during = lambda _: near.append(bench.world.count_subscribers("/wrist/detections_3d"))
     assert bench.ask().success
     assert near[:2] == [1, 0]  # the detector of the camera on the hand wakes during the motion to the pre-grasp
@@ -63,7 +62,7 @@ def test_order_of_hand_and_arm(bench):
         "execute",  # leave
         "move home",
     ]
-    bench.until(lambda: holds and not holds[-1].values, 20.0, "the arm is left to others")
+    bench.until(lambda: holds and not holds[-1].values, what="the arm is left to others")
     assert {hold.name for hold in holds} == {"the grasp node (a grasp of 'red')"}
     assert {tuple(value.key for value in hold.values) for hold in holds} == {("right",), ()}
     assert {goal_id[:8].hex() for goal_id in bench.world.goal_ids} == {holds[0].hardware_id}
@@ -77,7 +76,7 @@ def test_the_action_gives_feedback_and_the_same_answer(bench):
     _, result = bench.ros.send_goal(
         bench.action, goal, feedback_callback=lambda m: heard.append(m.feedback.status.state)
     )
-    answer = bench.ros.result(result, 30.0).result
+    answer = bench.ros.result(result).result
     assert answer.success, answer.message
     assert answer.arm == "left"
     assert (answer.place_position.x, answer.place_position.y) == (0.3, 0.3)
@@ -113,14 +112,13 @@ def test_a_second_request_is_refused_at_once(bench):
     bench.world.during = lambda what: held_up if what == "execute" else None
     first = bench.service.call_async(Grasp.Request(label="red"))
     bench.until(lambda: "execute" in bench.world.log, what="the arm moves")
-    begin = time.monotonic()
     second = bench.ask("blue")
-    assert time.monotonic() - begin < 2.0  # the first has not ended
     assert (second.success, second.code) == (False, "BUSY")
+    assert not first.done()
     _, result = bench.ros.send_goal(bench.action, Pick.Goal(label="blue"))
     assert bench.ros.result(result).result.code == "BUSY"
     held_up.set_result(None)
-    assert bench.ros.result(first, 30.0).success
+    assert bench.ros.result(first).success
 
 
 def test_an_unknown_object_is_refused_with_what_is_in_view(bench):
@@ -148,7 +146,7 @@ def test_an_unknown_arm_and_a_place_off_the_table_are_refused(bench):
     assert "auto, left, right" in answer.message
     request = Grasp.Request(label="red", has_place_position=True)
     request.place_position.x = 3.0
-    answer = bench.ros.call(bench.service, request, 20.0)
+    answer = bench.ros.call(bench.service, request)
     assert answer.code == "INVALID_ARGUMENT"
     assert "not on the table" in answer.message
     answer = bench.ask(label="x" * 1_000_000)
@@ -174,7 +172,7 @@ def test_a_dry_run_moves_nothing(bench):
 def test_an_object_is_put_down_on_the_table_as_it_was_measured(bench):
     edge = matrix_to_transform("world", "table", se3.make(None, (0.0, 0.0, 0.415)), 0)
     bench.world.create_publisher(TFMessage, "/tf_static", QOS_LATCHED).publish(TFMessage(transforms=[edge]))
-    bench.until(lambda: bench.node._session.context.table.top_z == pytest.approx(0.415), 20.0, "another table")
+    bench.until(lambda: bench.node._session.context.table.top_z == pytest.approx(0.415), what="another table")
     for position in bench.world.objects.values():
         position[2] += 0.015
     answer = bench.ask(dry_run=True)
@@ -188,7 +186,7 @@ def test_a_cancel_stops_the_arm_and_keeps_the_hand_closed(bench):
     handle, result = bench.ros.send_goal(bench.action, Pick.Goal(label="red"))
     bench.until(lambda: bench.world.held and bench.world.log[-1] == "execute", what="the lift")
     bench.ros.result(handle.cancel_goal_async())
-    answer = bench.ros.result(result, 5.0)
+    answer = bench.ros.result(result)
     assert answer.status == GoalStatus.STATUS_CANCELED
     assert answer.result.code == "CANCELLED"
     assert bench.world.cancelled == ["execute"]
@@ -208,10 +206,9 @@ def test_a_robot_that_goes_silent_ends_the_grasp_within_two_seconds(bench):
     asked = bench.service.call_async(Grasp.Request(label="red"))
     bench.until(lambda: "execute" in bench.world.log, what="the arm moves")
     bench.world.silent = True
-    begin = time.monotonic()
-    answer = bench.ros.result(asked, 5.0)
+    answer = bench.ros.result(asked)
     assert answer.code == "ROBOT_LOST"
-    assert time.monotonic() - begin < 2.0
+    assert silence(answer.message) < 2.0
     never.set_result(None)
     # And it works again when the robot is back.
     bench.world.silent, bench.world.during = False, lambda what: None
@@ -239,7 +236,7 @@ def test_nothing_is_subscribed_while_idle_and_detections_only_while_looking(benc
     bench.until(lambda: probe.count_subscribers("/detections_3d") == 0, what="detections are left")
     assert probe.count_subscribers("/joint_states") == 1
     held_up.set_result(None)
-    assert bench.ros.result(asked, 30.0).success
+    assert bench.ros.result(asked).success
     bench.until(lambda: probe.count_subscribers("/joint_states") == 0, what="joint states are left")
     assert probe.count_subscribers("/detections_3d") == 0
 
@@ -255,11 +252,12 @@ def test_a_pregrasp_within_the_path_tolerance_is_refused_at_start(ros):
 @pytest.mark.requirement("N-19")
 def test_a_state_that_takes_longer_than_its_budget_is_a_warning_in_diagnostics_and_in_the_answer(ros):
     world = ros.add(FakeGraph())
-    node = ros.add(GraspNode(parameter_overrides=[Parameter("budget.close_gripper", value=0.1)]))
+    budgets = {name: 0.1 if name == "close_gripper" else 600.0 for name in BudgetConfig.model_fields}
+    node = ros.add(GraspNode(parameter_overrides=[Parameter(f"budget.{k}", value=v) for k, v in budgets.items()]))
     heard: list[DiagnosticStatus] = []
     ros.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: heard.extend(m.status), 10)
     service = ros.node.create_client(Grasp, "/grasp")
-    answer = ros.call(service, Grasp.Request(label="red"), 30.0)
+    answer = ros.call(service, Grasp.Request(label="red"))
     assert answer.success, answer.message
     late = [one.state for one in answer.state_times if 0.0 < one.budget < one.longest]
     assert late == ["CLOSE_GRIPPER"]
@@ -267,5 +265,5 @@ def test_a_state_that_takes_longer_than_its_budget_is_a_warning_in_diagnostics_a
     def warned() -> list[str]:
         return [one.message for one in heard if one.level == DiagnosticStatus.WARN and node.get_name() in one.name]
 
-    ros.spin_until(lambda: any("CLOSE_GRIPPER" in text for text in warned()), 20.0, "the warning")
+    ros.spin_until(lambda: any("CLOSE_GRIPPER" in text for text in warned()), what="the warning")
     assert world.log

@@ -156,26 +156,26 @@ class Bench:
 
     def _add_motion(self, node: MotionNode) -> None:
         self.node, ros = node, self.ros
-        ros.spin_until(lambda: node.robot.state_age() < 0.5, 10.0, "joint states")
-        ros.spin_until(lambda: "table" in node.robot.states._static, 10.0, "the table's frame")
+        ros.spin_until(lambda: node.robot.state_age() < 0.5, what="joint states")
+        ros.spin_until(lambda: "table" in node.robot.states._static, what="the table's frame")
         for arm in node.service.arms:
-            ros.spin_until(node.robot.controller(arm).ready, 10.0, "controllers")
+            ros.spin_until(node.robot.controller(arm).ready, what="controllers")
 
     def start(self, client: ActionClient, goal, **kwargs) -> tuple[ClientGoalHandle, Future]:
         handle, future = self.ros.send_goal(client, goal, **kwargs)
         assert handle.accepted
         return handle, future
 
-    def run(self, client: ActionClient, goal, timeout: float = 10.0, **kwargs):
+    def run(self, client: ActionClient, goal, **kwargs):
         """Send a goal and return its result."""
         _, future = self.start(client, goal, **kwargs)
-        return self.ros.result(future, timeout).result
+        return self.ros.result(future).result
 
     def begin(self, side: str, trajectory: JointTrajectory) -> tuple[ClientGoalHandle, Future]:
         """Send a trajectory and wait until the arm is on its way."""
         goal = ExecuteTrajectory.Goal(arm=side, trajectory=trajectory)
         handle, future = self.start(self.execute_client, goal)
-        self.ros.spin_until(lambda: side in self.robot.active or future.done(), 10.0, "the arm to start")
+        self.ros.spin_until(lambda: side in self.robot.active or future.done(), what="the arm to start")
         assert not future.done(), future.result()
         return handle, future
 
@@ -192,7 +192,7 @@ class Bench:
         return MoveArm.Goal(arm=arm, kind=MoveArm.Goal.NAMED, named=posture, velocity_scale=1.0, **kwargs)
 
     def slow_plan(self, side: str = "right") -> JointTrajectory:
-        """A motion that takes long enough to be disturbed: 40 s of the robot's time, 10 of the wall clock."""
+        """A motion that takes long enough to be disturbed: 40 s of the robot's time."""
         goal = self.named(side, plan_only=True)
         goal.velocity_scale = 0.02
         return self.run(self.move_client, goal).trajectory

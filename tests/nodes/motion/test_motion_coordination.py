@@ -80,7 +80,7 @@ def test_an_arm_began_when_its_controller_says(bench, tells: bool) -> None:
     bench.robot.tells = tells
     handle, left = bench.begin("left", bench.slow_plan("left"))
     follower = bench.node.service.coordination.followers["left"]
-    bench.ros.spin_until(lambda: follower.active is not None and follower.active.certain, 5.0, "the start is known")
+    bench.ros.spin_until(lambda: follower.active is not None and follower.active.certain, what="the start is known")
     error = abs(follower.active.since_ns - bench.robot.active["left"][0]) * 1e-9
     assert error == 0.0 if tells else error <= FASTER * 0.5
     handle.cancel_goal_async()
@@ -114,7 +114,7 @@ def test_an_arm_holds_when_the_other_stops_in_its_way(bench) -> None:
     slow, quick = leaving(bench)
     handle, left = bench.start(bench.execute_client, execute("left", slow))
     _, right = bench.start(bench.execute_client, execute("right", quick))
-    bench.ros.spin_until(lambda: "right" in bench.robot.active, 10.0, "the right arm to be commanded")
+    bench.ros.spin_until(lambda: "right" in bench.robot.active, what="the right arm to be commanded")
     bench.robot.speed = 0.5  # the cancel arrives before the way is free, on a busy machine too
     handle.cancel_goal_async()
     gap = nearest(bench, [left, right])
@@ -151,7 +151,7 @@ def test_an_approach_is_planned_around_where_the_other_arm_will_end(bench) -> No
     assert (blocked.success, blocked.failure.stage) == (False, "goal"), blocked.message
     assert "openarm_left_" in blocked.failure.second
     _, left = bench.start(bench.execute_client, execute("left", slow))
-    bench.ros.spin_until(lambda: "left" in bench.robot.active, 5.0, "the left arm to set out")
+    bench.ros.spin_until(lambda: "left" in bench.robot.active, what="the left arm to set out")
     plan = bench.run(bench.plan_client, approach("right", -0.02))
     assert plan.success, plan.message
     assert 0.0 < plan.start_delay < slow.points[-1].time_from_start.sec + 1.0
@@ -201,7 +201,7 @@ def holding(bench):
     plan = bench.run(bench.plan_client, approach("right", -0.24))
     for part in (plan.transfer, plan.approach, plan.retreat):
         assert bench.run(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=part)).success
-    bench.ros.spin_until(lambda: bench.held() == ["right/cube"], 5.0, "the cube to be shown as held")
+    bench.ros.spin_until(lambda: bench.held() == ["right/cube"], what="the cube to be shown as held")
     return bench
 
 
@@ -231,7 +231,7 @@ def test_what_is_held_stays_so_until_a_request_says_otherwise(holding) -> None:
     assert result.code == "INVALID_ARGUMENT"
     assert "attached names cup, and hand_empty is true" in result.message
     assert bench.run(bench.move_client, bench.named("right", "home", hand_empty=True)).success
-    bench.ros.spin_until(lambda: bench.held() == [], 5.0, "an empty hand")
+    bench.ros.spin_until(lambda: bench.held() == [], what="an empty hand")
 
 
 @pytest.mark.requirement("P-04")
@@ -242,4 +242,4 @@ def test_motions_of_both_arms_keep_what_is_held(holding) -> None:
     assert bench.held() == ["right/cube"]
     targets[1].hand_empty = True
     assert bench.run(bench.both_client, MoveArms.Goal(targets=targets, velocity_scale=1.0)).success
-    bench.ros.spin_until(lambda: bench.held() == [], 5.0, "an empty hand")
+    bench.ros.spin_until(lambda: bench.held() == [], what="an empty hand")

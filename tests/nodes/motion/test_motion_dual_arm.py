@@ -32,7 +32,7 @@ def watched(bench, goal: MoveArms.Goal) -> tuple[MoveArms.Result, float]:
     both = DualArm(arms["left"], arms["right"])
     _, future = bench.start(bench.both_client, goal)
     seen: list[dict[str, float]] = []
-    bench.ros.spin_until(lambda: seen.append(dict(bench.robot.state)) or future.done(), 20.0, "both arms")
+    bench.ros.spin_until(lambda: seen.append(dict(bench.robot.state)) or future.done(), what="both arms")
     scene = both.scene(seen[0])
     configurations = np.unique([[state[name] for name in both.names] for state in seen], axis=0)
     return future.result().result, min(scene.separation(q) for q in configurations)
@@ -90,7 +90,7 @@ def test_when_one_arm_fails_the_other_holds(bench) -> None:
     goal = both_goal(*targets)
     goal.velocity_scale = 0.2
     bench.robot.fail_after = {"right": 0.5}
-    result = bench.run(bench.both_client, goal, 20.0)
+    result = bench.run(bench.both_client, goal)
     assert (result.success, result.code) == (False, "EXECUTION_FAILED"), result.message
     assert "left" in bench.robot.cancelled
     # and both are free again
@@ -102,7 +102,7 @@ def test_cancel_holds_both(bench) -> None:
     goal = both_goal(*[ArmTarget(arm=arm, kind=ArmTarget.NAMED, named="official_home") for arm in ("left", "right")])
     goal.velocity_scale = 0.05
     handle, future = bench.start(bench.both_client, goal)
-    bench.ros.spin_until(lambda: len(bench.robot.active) == 2, 10.0, "both arms on their way")
+    bench.ros.spin_until(lambda: len(bench.robot.active) == 2, what="both arms on their way")
     busy = bench.run(bench.move_client, bench.named("left"))
     assert busy.code == "BUSY"
     bench.ros.result(handle.cancel_goal_async())

@@ -19,6 +19,7 @@ from openarm_common.ros.convert import (
     trajectory_from_msg,
     trajectory_to_msg,
 )
+from tests.nodes.motion.conftest import FASTER
 
 
 # --- execution
@@ -45,7 +46,7 @@ def test_cancel_holds(bench) -> None:
     handle, future = bench.start(
         bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=bench.slow_plan())
     )
-    bench.ros.spin_until(lambda: "right" in bench.robot.active, 20.0, "the arm to start")
+    bench.ros.spin_until(lambda: "right" in bench.robot.active, what="the arm to start")
     bench.ros.result(handle.cancel_goal_async())
     answer = bench.ros.result(future)
     assert answer.status == 5  # canceled
@@ -98,13 +99,13 @@ def test_the_tool_must_end_within_its_tolerance(bench) -> None:
 def test_a_silent_robot_ends_a_motion_within_two_seconds(bench) -> None:
     _, future = bench.begin("right", bench.slow_plan())
     bench.robot.silent = True
-    begin = time.monotonic()
+    begin_ns = bench.robot.t_ns
     result = bench.ros.result(future).result
-    assert time.monotonic() - begin < 2.0
+    assert bench.robot.t_ns - begin_ns < 2e9 * FASTER  # a clock of this executor: a halt of the machine does not count
     assert (result.success, result.code) == (False, "ROBOT_LOST")
     assert "no /joint_states" in result.message
     # and nothing new is begun
-    bench.ros.spin_until(lambda: bench.node.robot.state_age() > 1.3, 20.0, "old joint states")
+    bench.ros.spin_until(lambda: bench.node.robot.state_age() > 1.3, what="old joint states")
     result = bench.run(bench.move_client, bench.named("left"))
     assert result.code == "NOT_READY"
     assert "no fresh /joint_states" in result.message
@@ -112,11 +113,11 @@ def test_a_silent_robot_ends_a_motion_within_two_seconds(bench) -> None:
 
 def test_a_controller_that_vanishes_ends_a_motion_within_two_seconds(bench) -> None:
     _, future = bench.begin("right", bench.slow_plan())
-    begin = time.monotonic()
+    begin_ns = bench.robot.t_ns
     bench.robot.servers["right"].destroy()
     bench.robot.ignore_regions.add("right")
     result = bench.ros.result(future).result
-    assert time.monotonic() - begin < 2.0
+    assert bench.robot.t_ns - begin_ns < 2e9 * FASTER
     assert (result.success, result.code) == (False, "ROBOT_LOST")
 
 
@@ -126,13 +127,13 @@ def test_stopping_the_motion_process_on_the_way_holds_the_arm(make_bench) -> Non
     with subprocess.Popen(command, env=os.environ, stderr=subprocess.DEVNULL) as process:
         try:
             bench.ros.spin_until(bench.move_client.server_is_ready, 60.0, "the process")
-            deadline = time.monotonic() + 30.0
+            deadline = time.monotonic() + 60.0
             while not (plan := bench.slow_plan()).points:  # it has not heard the robot or met its controllers yet
                 assert time.monotonic() < deadline, "the process does not plan"
             bench.start(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=plan))
-            bench.ros.spin_until(lambda: "right" in bench.robot.active, 20.0, "the arm to start")
+            bench.ros.spin_until(lambda: "right" in bench.robot.active, 60.0, "the arm to start")
             process.send_signal(signal.SIGTERM)
-            bench.ros.spin_until(lambda: process.poll() is not None, 20.0, "its end")
+            bench.ros.spin_until(lambda: process.poll() is not None, 60.0, "its end")
         finally:
             process.kill()
     assert process.returncode == 0

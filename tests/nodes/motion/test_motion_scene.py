@@ -41,7 +41,7 @@ def test_the_table_is_where_its_frame_is(bench) -> None:
     edge = matrix_to_transform("world", "table", se3.make(None, (0.0, 0.0, 0.415)), 0)
     bench.robot.tf.publish(TFMessage(transforms=[edge]))
     service = bench.node.service
-    bench.ros.spin_until(lambda: service.scene.version == planned + 1, 10.0, "another table")
+    bench.ros.spin_until(lambda: service.scene.version == planned + 1, what="another table")
     scene = bench.ros.call(bench.get_client, GetScene.Request())
     (table,) = scene.objects
     assert table.pose.pose.position.z + table.size.z / 2.0 == pytest.approx(0.415)
@@ -72,7 +72,7 @@ def test_bodies_are_in_force_when_the_answer_comes(bench) -> None:
     assert result.failure.has_alternative
     assert len(result.failure.alternative) == 7
     assert 0.0 < result.failure.alternative_distance < 0.5
-    bench.ros.spin_until(lambda: shown and [m.ns for m in shown[-1].markers[1:]] == ["table", "post"], 5.0, "markers")
+    bench.ros.spin_until(lambda: shown and [m.ns for m in shown[-1].markers[1:]] == ["table", "post"], what="markers")
     answer = bench.ros.call(bench.apply_client, ApplyScene.Request(remove=["post"]))
     assert (answer.success, answer.version) == (True, 3)
     assert bench.run(bench.move_client, bench.named(plan_only=True)).success
@@ -153,7 +153,7 @@ def test_a_plan_is_shown_and_carried_out_when_a_human_agrees(bench) -> None:
     bench.ros.node.create_subscription(MarkerArray, "/motion/preview", shown.append, QOS_LATCHED)
     before = bench.q("right")
     plan = bench.run(bench.move_client, bench.named(plan_only=True))
-    bench.ros.spin_until(lambda: shown, 5.0, "the preview")
+    bench.ros.spin_until(lambda: shown, what="the preview")
     markers = {m.ns: m for m in shown[-1].markers if m.action == Marker.ADD}
     assert set(markers) == {"right/way", "right/start", "right/end"}
     arm = bench.node.service.arms["right"]

@@ -56,7 +56,7 @@ class Client:
         self.execute = ActionClient(self.node, ExecuteTrajectory, "/execute_trajectory")
 
     def call(self, kind, name: str, request):
-        return self.ros.call(self.node.create_client(kind, name), request, 30.0)
+        return self.ros.call(self.node.create_client(kind, name), request)
 
     def plan(self, request: MotionPlanRequest):
         asked = GetMotionPlan.Request(motion_plan_request=request)
@@ -127,7 +127,7 @@ def test_a_joint_goal_is_planned_shown_and_executed(client: Client) -> None:
     assert client.end(answer.trajectory) == pytest.approx(goal, abs=1e-3)
     client.ros.spin_until(lambda: shown, what="the plan on /display_planned_path")
     assert shown[0].trajectory[0] == answer.trajectory
-    result = client.bench.run(client.execute, ExecuteTrajectory.Goal(trajectory=answer.trajectory), 30.0)
+    result = client.bench.run(client.execute, ExecuteTrajectory.Goal(trajectory=answer.trajectory))
     assert result.error_code.val == Codes.SUCCESS, result.error_code.message
     assert client.q() == pytest.approx(goal, abs=2e-3)
 
@@ -137,7 +137,7 @@ def test_move_action_plans_and_moves_to_a_pose_within_its_tolerance(client: Clie
     T = client.arm.kinematics.fk(client.named())
     T[:3, 3] += (0.02, 0.03, 0.04)
 
-    result = client.bench.run(client.move, MoveGroup.Goal(request=client.pose_goal(T)), 30.0)
+    result = client.bench.run(client.move, MoveGroup.Goal(request=client.pose_goal(T)))
 
     assert result.error_code.val == Codes.SUCCESS, result.error_code.message
     there = client.arm.kinematics.fk(client.q())
@@ -158,11 +158,11 @@ def test_a_goal_that_is_cancelled_ends_with_the_arm_holding(client: Client) -> N
     goal = MoveGroup.Goal(request=client.joint_goal(client.named()))
     goal.request.max_velocity_scaling_factor = goal.request.max_acceleration_scaling_factor = 0.05
     handle, future = client.bench.start(client.move, goal)
-    client.ros.spin_until(lambda: SIDE in client.bench.robot.active, 30.0, "the arm to set out")
+    client.ros.spin_until(lambda: SIDE in client.bench.robot.active, what="the arm to set out")
 
     handle.cancel_goal_async()
 
-    assert client.ros.result(future, 30.0).result.error_code.val == Codes.PREEMPTED
+    assert client.ros.result(future).result.error_code.val == Codes.PREEMPTED
     assert SIDE not in client.bench.robot.active
 
 
@@ -172,11 +172,11 @@ def test_the_event_stop_ends_what_is_executed(client: Client) -> None:
     publisher = client.node.create_publisher(String, "/trajectory_execution_event", 1)
     client.ros.spin_until(publisher.get_subscription_count, what="a listener")
     _, future = client.bench.start(client.move, goal)
-    client.ros.spin_until(lambda: SIDE in client.bench.robot.active, 30.0, "the arm to set out")
+    client.ros.spin_until(lambda: SIDE in client.bench.robot.active, what="the arm to set out")
 
     publisher.publish(String(data="stop"))
 
-    assert client.ros.result(future, 30.0).result.error_code.val == Codes.PREEMPTED
+    assert client.ros.result(future).result.error_code.val == Codes.PREEMPTED
 
 
 def test_a_start_state_is_where_a_plan_begins(client: Client) -> None:
@@ -226,7 +226,7 @@ def test_a_start_that_violates_the_path_constraint_is_named_so(client: Client) -
 
 
 def test_a_straight_line_is_followed_as_far_as_it_goes(client: Client) -> None:
-    client.bench.run(client.move, MoveGroup.Goal(request=client.joint_goal(client.named())), 30.0)
+    client.bench.run(client.move, MoveGroup.Goal(request=client.joint_goal(client.named())))
     T = client.arm.kinematics.fk(client.q())
     near, far = T.copy(), T.copy()
     near[2, 3] += 0.05

@@ -31,7 +31,7 @@ class Client:
         self.node.create_subscription(JointTrajectory, topic, self.sent.append, 10)
 
     def call(self, kind, name: str, request=None):
-        return self.ros.call(self.node.create_client(kind, f"{self.name}/{name}"), request or kind.Request(), 30.0)
+        return self.ros.call(self.node.create_client(kind, f"{self.name}/{name}"), request or kind.Request())
 
     def send(self, message, done) -> None:
         """Send a message again and again until something is so."""
@@ -41,7 +41,7 @@ class Client:
             publisher.publish(message)
             return done()
 
-        self.ros.spin_until(ask, 10.0, "an answer")
+        self.ros.spin_until(ask, what="an answer")
 
     def refusal(self, message) -> str:
         """The sentence with which a message is refused."""

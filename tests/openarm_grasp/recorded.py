@@ -1,0 +1,591 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests of the grasp on a robot that is simulated, or on what one answered when it was recorded.
+
+A recording has each answer of the robot's interface in its order, and the joint states at every tick. The strategies
+run on it as on the robot: they must ask for the same, and find out the same, in a hundredth of the time. What is asked
+otherwise than before fails the test; `openarm test --record PATH` simulates again and writes the recordings anew.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from openarm_common import se3
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.housings import mounted
+from openarm_common.detection import Detection
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.labelled_cloud import LabelledCloud
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.scene.scene import Scene
+from openarm_evaluation.campaign.in_process_robot import InProcessRobot
+from openarm_evaluation.campaign.robot import SimulatedSenses, together, turn
+from openarm_evaluation.campaign.tasks.task import Task
+from openarm_evaluation.campaign.trial import Trials
+from openarm_evaluation.judging.trial import Step
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.context import GraspContext
+from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.perception.detections import Frame
+from openarm_grasp.planning.candidates import Box
+from openarm_grasp.planning.options import NoWayError
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest
+from openarm_grasp.requests.task import GraspSession, Status
+from openarm_grasp.requests.task import Task as GraspTask
+from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, check_deadline
+from openarm_grasp.robot.skills import Skills
+from openarm_grasp.strategies.registry import carry_out
+
+#: Points of clouds are kept in steps of this, m; the noise of depth is larger.
+_STEP = 5e-4
+#: Joint positions are kept in steps of this, rad or m.
+_FINE = 1e-6
+#: Poses of objects are kept in steps of this, m.
+_TRUE = 1e-5
+#: Arrays of so few numbers stand in the text.
+_SMALL = 16
+#: What is asked for may differ by this from what was recorded, m and rad: rounding of another machine.
+_SAME = 1e-4
+_KINDS = {kind.__name__: kind for kind in (Detection, LabelledCloud, Frame, Frames, Planned, Verdict, Box)}
+
+
+@dataclass
+class Call:
+    """A question to the robot and its answer.
+
+    Attributes:
+        what: Method and arguments that are compared word by word.
+        poses: Arguments that are compared by number, flat.
+        end: Tick at which the answer came.
+        answer: The answer.
+        error: Or the error: code, message, refusals.
+    """
+
+    what: list[Any]
+    poses: np.ndarray
+    end: int = -1
+    answer: Any = None
+    error: tuple[str, str, Mapping[str, Verdict] | None] | None = None
+
+
+@dataclass
+class Tape:
+    """What a robot answered.
+
+    Attributes:
+        joints: Names.
+        objects: Names.
+        clock_ns: Time at each tick.
+        state_ns: Stamp of the newest joint state at each tick.
+        q: (ticks, joints).
+        truth: (ticks, objects, 7) position, m, and quaternion xyzw of each object, for the test.
+    """
+
+    joints: tuple[str, ...]
+    objects: tuple[str, ...]
+    clock_ns: list[int] = field(default_factory=list[int])
+    state_ns: list[int] = field(default_factory=list[int])
+    q: list[np.ndarray] = field(default_factory=list[np.ndarray])
+    truth: list[np.ndarray] = field(default_factory=list[np.ndarray])
+    calls: list[Call] = field(default_factory=list[Call])
+
+    def write(self, path: Path) -> None:
+        """Write a .npz file."""
+        arrays: list[np.ndarray] = []
+        calls = [[c.what, _packed(c.poses, arrays), c.end, _packed(c.answer, arrays), _packed(c.error, arrays)]
+                 for c in self.calls]  # fmt: skip
+        data = {
+            "calls": np.frombuffer(json.dumps([self.joints, self.objects, calls]).encode(), np.uint8),
+            "clock_ns": np.diff(np.array(self.clock_ns), prepend=0),
+            "state_ns": np.diff(np.array(self.state_ns), prepend=0),
+            "q": _steps(self.q, _FINE),
+            "truth": _steps(self.truth, _TRUE),
+        } | {f"array{k}": array for k, array in enumerate(arrays)}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as file:
+            for name, array in data.items():
+                buffer = io.BytesIO()
+                np.lib.format.write_array(buffer, np.ascontiguousarray(array))
+                file.writestr(zipfile.ZipInfo(f"{name}.npy"), buffer.getvalue(), zipfile.ZIP_LZMA)
+
+    @classmethod
+    def read(cls, path: Path) -> Tape:
+        """Read what `write` has written."""
+        with np.load(path) as data:
+            arrays = {name: data[name] for name in data.files}
+        joints, objects, calls = json.loads(arrays["calls"].tobytes())
+        tape = cls(tuple(joints), tuple(objects))
+        tape.clock_ns = np.cumsum(arrays["clock_ns"]).tolist()
+        tape.state_ns = np.cumsum(arrays["state_ns"]).tolist()
+        tape.q = list(np.cumsum(arrays["q"].T, axis=0) * _FINE)
+        tape.truth = list(np.cumsum(arrays["truth"].T, axis=0).reshape(len(tape.q), len(objects), 7) * _TRUE)
+        for what, poses, end, answer, error in calls:
+            unpacked = [_unpacked(one, arrays) for one in (poses, answer, error)]
+            tape.calls.append(Call(what, unpacked[0], end, unpacked[1], unpacked[2]))
+        return tape
+
+
+def _steps(rows: Sequence[np.ndarray], step: float) -> np.ndarray:
+    """Changes from row to row in whole steps, (numbers, rows)."""
+    table = np.round(np.array(rows).reshape(len(rows), -1) / step).astype(np.int32)
+    return np.diff(table, axis=0, prepend=0 * table[:1]).T
+
+
+def _packed(value: Any, arrays: list[np.ndarray]) -> Any:
+    """Value as JSON, its arrays apart."""
+
+    def array(one: np.ndarray) -> int:
+        arrays.append(one)
+        return len(arrays) - 1
+
+    if isinstance(value, LabelledCloud):
+        steps = np.round(value.points / _STEP).astype(np.int16)
+        steps = np.diff(steps, axis=0, prepend=0 * steps[:1]).T
+        return {"cloud": [array(steps), array(value.labels.astype(np.uint16)), array(value.camera)]}
+    if isinstance(value, np.ndarray):
+        small = value.size <= _SMALL and value.dtype == np.float64
+        return {"values": [value.shape, value.ravel().tolist()]} if small else {"array": array(value)}
+    if isinstance(value, Code):
+        return {"code": value.value}
+    if is_dataclass(value):
+        kind = next(
+            name for name, known in _KINDS.items() if isinstance(value, known)
+        )  # of a detection, what grasping reads
+        return {kind: {f.name: _packed(getattr(value, f.name), arrays) for f in fields(_KINDS[kind])}}
+    if isinstance(value, Mapping):
+        return {"map": [[key, _packed(one, arrays)] for key, one in value.items()]}
+    if isinstance(value, tuple | list):
+        return [_packed(one, arrays) for one in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _unpacked(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    if isinstance(value, list):
+        return tuple(_unpacked(one, arrays) for one in value)
+    if not isinstance(value, dict):
+        return value
+    ((kind, of),) = value.items()
+    if kind == "array":
+        return arrays[f"array{of}"]
+    if kind == "values":
+        return np.array(of[1], np.float64).reshape(of[0])
+    if kind == "code":
+        return Code(of)
+    if kind == "map":
+        return {key: _unpacked(one, arrays) for key, one in of}
+    if kind == "cloud":
+        steps, labels, camera = (arrays[f"array{k}"] for k in of)
+        points = np.cumsum(steps.T, axis=0, dtype=np.int16).astype(np.float32) * np.float32(_STEP)
+        return LabelledCloud(points, labels.astype(np.uint32), camera)
+    return _KINDS[kind](**{name: _unpacked(one, arrays) for name, one in of.items()})
+
+
+def _asked(request: PlanGrasp | PlanPlace) -> tuple[list[Any], np.ndarray]:
+    """What is compared of a plan: ids by word, poses by number."""
+    ways = request.candidates if isinstance(request, PlanGrasp) else request.targets
+    own = request.target if isinstance(request, PlanGrasp) else request.held
+    boxes = (*request.obstacles, *own, *request.ignore_regions)
+    words = [type(request).__name__, request.arm, [way.id for way in ways], [box.id for box in boxes]]
+    numbers = [way.T_base_tcp[:3].ravel() for way in ways]
+    numbers += [part for way in ways for part in (way.approach_offset, way.retreat_offset)]
+    numbers += [part for box in boxes for part in (box.T_frame_box[:3].ravel(), np.asarray(box.size))]
+    return words, np.concatenate([*numbers, np.zeros(0)])
+
+
+class SimulatedRobot(InProcessRobot):
+    """The robot of a campaign, which notes what it answers.
+
+    Args:
+        trials: Whose robot.
+        config: Parameters of the grasp.
+        clouds: Whether frames have points.
+    """
+
+    def __init__(self, trials: Trials, config: GraspConfig, *, clouds: bool) -> None:
+        super().__init__(trials.robot, config)
+        self._clouds = clouds
+        self.tape = Tape(tuple(self.robot.world.joint_names), tuple(item.name for item in self.robot.scene.objects))
+        self._stopped = False
+        tick = self.robot.tick
+
+        def noted() -> None:
+            tick()
+            self._note()
+
+        self.robot.tick = noted  # type: ignore[method-assign]
+        self._note()
+
+    def _note(self) -> None:
+        self.tape.clock_ns.append(self.robot.t_ns)
+        self.tape.state_ns.append(self.now_ns)
+        self.tape.q.append(self.robot.trace[-1][1])
+        poses = [readout.T_world_object for readout in self.robot.world.objects()]
+        self.tape.truth.append(np.array([[*T[:3, 3], *se3.quat_xyzw_from_matrix(T[:3, :3])] for T in poses]))
+
+    def check(self) -> None:
+        try:
+            super().check()
+        except OpenArmError:
+            self._stopped = True
+            raise
+
+    @property
+    def now_tick(self) -> int:
+        """Number of ticks so far."""
+        return len(self.tape.q) - 1
+
+    def _begin(self, *what: Any, poses: Sequence[Any] | np.ndarray = ()) -> Call:
+        self.tape.calls.append(Call(list(what), np.asarray(poses, np.float64).ravel()))
+        return self.tape.calls[-1]
+
+    def _end(self, call: Call, answer: Any) -> Any:
+        call.answer, call.end = answer, self.now_tick
+        return answer
+
+    async def _ask(self, call: Call, work: Awaitable[Any]) -> Any:
+        self._stopped = False
+        try:
+            return self._end(call, await work)
+        except OpenArmError as error:
+            self._end(call, None)
+            if not self._stopped:  # else it is what the strategy found out
+                call.error = (error.code.value, error.message, getattr(error, "refusals", None))
+            raise
+
+    def effort(self, joint: str) -> float:
+        return self._end(self._begin("effort", joint), super().effort(joint))
+
+    def pads(self, arm: str) -> tuple[float, ...]:
+        return self._end(self._begin("pads", arm), super().pads(arm))
+
+    def held_box(self, arm: str) -> Box | None:
+        return self._end(self._begin("held_box", arm), super().held_box(arm))
+
+    async def observe(self, count: int, *, near: str = "") -> Frames:
+        call = self._begin("observe", count, near)
+        seen = await self._ask(call, super().observe(count, near=near))
+        if not self._clouds:
+            seen = replace(seen, frames=tuple(replace(frame, cloud=None) for frame in seen.frames))
+        arrays: list[np.ndarray] = []  # the strategy gets what will be read
+        packed = _packed(seen, arrays)
+        return self._end(call, _unpacked(packed, {f"array{k}": array for k, array in enumerate(arrays)}))
+
+    async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
+        words, poses = _asked(request)
+        call = self._begin("plan", *words, poses=poses)
+        plan = await self._ask(call, super().plan(request))
+        parts = {part: f"{part} {len(self.tape.calls)}" for part in ("transfer", "approach", "retreat")}
+        call.answer = replace(plan, **parts)
+        return plan
+
+    async def scene_version(self) -> int:
+        return await self._ask(self._begin("scene_version"), super().scene_version())
+
+    async def reach(self, arm: str, T_base_tcp: Any) -> Mapping[str, float]:
+        return await self._ask(self._begin("reach", arm, poses=T_base_tcp), super().reach(arm, T_base_tcp))
+
+    async def follow(self, arm: str, trajectory: object, what: str, guard: Callable[[], None] | None = None) -> None:
+        def watched() -> None:
+            try:
+                if guard is not None:
+                    guard()
+            except OpenArmError:
+                self._stopped = True
+                raise
+
+        call = self._begin("follow", arm, what)
+        await self._ask(call, super().follow(arm, trajectory, what, watched))
+
+    async def move(
+        self, arm: str, to: Any, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
+    ) -> None:
+        call = self._begin(*_moved(arm, to, what, plan_only), poses=() if isinstance(to, str) else to)
+        await self._ask(call, super().move(arm, to, what, obstacles, plan_only=plan_only))
+
+    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
+        call = self._begin("grip", arm, joint, what, poses=(position, effort))
+        return await self._ask(call, super().grip(arm, joint, position, what, effort))
+
+
+def _moved(arm: str, to: Any, what: str, plan_only: bool) -> list[Any]:
+    return ["move", arm, to if isinstance(to, str) else "", what, plan_only]
+
+
+class RecordedRobot:
+    """A robot that answers as it did when it was recorded; implements `openarm_grasp.robot.interface.RobotInterface`.
+
+    Args:
+        tape: What it answered.
+        config: Parameters of the grasp.
+    """
+
+    def __init__(self, tape: Tape, config: GraspConfig) -> None:
+        self.tape, self._config = tape, config
+        self.description = RobotDescription.load()
+        self.states = RobotStateBuffer(self.description)
+        self.base_frame = self.description.root
+        self.deadline_ns, self.cancelled = 0, ""
+        self.watch: Callable[[], None] = lambda: None
+        self._tick, self._calls = -1, 0
+        self.together = together
+        self.tick()
+
+    def tick(self) -> None:
+        """Let one control tick pass."""
+        self._tick += 1
+        if self._tick == len(self.tape.q):
+            pytest.fail("the recording ends here, the grasp goes on; record again (openarm test --record PATH)")
+        if self.tape.state_ns[self._tick] == self.tape.clock_ns[self._tick]:
+            self.states.add_joint_state(self.t_ns, self.tape.joints, self.tape.q[self._tick].tolist())
+
+    @property
+    def now_tick(self) -> int:
+        """Number of ticks so far."""
+        return self._tick
+
+    @property
+    def t_ns(self) -> int:
+        """Time of the simulation that was recorded."""
+        return self.tape.clock_ns[self._tick]
+
+    def run(self, work: Any) -> Any:
+        """Carry out a coroutine of this robot, one tick a turn."""
+        while True:
+            try:
+                work.send(None)
+            except StopIteration as end:
+                return end.value
+            self.tick()
+
+    def _next(self, *what: Any, poses: Sequence[Any] | np.ndarray = ()) -> Call:
+        """The next answer, which must be that to the same question."""
+        if self._calls == len(self.tape.calls):
+            pytest.fail(f"the recording has no more answers; asked: {list(what)}")
+        call, asked = self.tape.calls[self._calls], np.asarray(poses, np.float64).ravel()
+        self._calls += 1
+        if json.loads(json.dumps(what)) != call.what:
+            pytest.fail(f"asked: {list(what)}; when it was recorded: {call.what}")
+        if asked.shape != call.poses.shape or np.abs(asked - call.poses).max(initial=0.0) > _SAME:
+            pytest.fail(f"asked with other poses or sizes than when it was recorded: {list(what)}")
+        return call
+
+    async def _answer(self, call: Call, guard: Callable[[], None] | None = None) -> Any:
+        faults: list[OpenArmError] = []
+        while self._tick < call.end:
+            try:
+                if not faults:
+                    self.check()
+                    if guard is not None:
+                        guard()
+            except OpenArmError as error:
+                faults.append(error)
+            await turn()
+        if faults:
+            raise faults[0]
+        if call.error is None:
+            return call.answer
+        code, message, refusals = call.error
+        raise OpenArmError(Code(code), message) if refusals is None else NoWayError(Code(code), message, refusals)
+
+    @property
+    def now_ns(self) -> int:
+        return self.states.latest()[0]
+
+    def effort(self, joint: str) -> float:
+        return self._next("effort", joint).answer
+
+    def pads(self, arm: str) -> tuple[float, ...]:
+        return self._next("pads", arm).answer
+
+    def held_box(self, arm: str) -> Box | None:
+        return self._next("held_box", arm).answer
+
+    def check(self) -> None:
+        self.watch()
+        if self.cancelled:
+            raise OpenArmError(Code.CANCELLED, self.cancelled)
+        check_deadline(self.now_ns, self.deadline_ns)
+        silent_s = (self.t_ns - self.now_ns) * 1e-9
+        if silent_s > self._config.limits.joint_state_timeout:
+            raise OpenArmError(Code.ROBOT_LOST, f"joint states have been silent for {silent_s:.1f} s")
+
+    def warn(self, text: str) -> None:
+        """Nothing to warn."""
+
+    def expect_near(self, camera: str) -> None:
+        """Nothing to wake."""
+
+    def stop_observing(self) -> None:
+        """Nothing observes."""
+
+    async def until(
+        self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        deadline_ns = self.t_ns + limit * 1e9
+        while not done():
+            self.check()
+            if guard is not None:
+                guard()
+            if self.t_ns > deadline_ns:
+                raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
+            await turn()
+
+    async def observe(self, count: int, *, near: str = "") -> Frames:
+        return await self._answer(self._next("observe", count, near))
+
+    async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
+        words, poses = _asked(request)
+        return await self._answer(self._next("plan", *words, poses=poses))
+
+    async def scene_version(self) -> int:
+        return await self._answer(self._next("scene_version"))
+
+    async def reach(self, arm: str, T_base_tcp: Any) -> Mapping[str, float]:
+        return await self._answer(self._next("reach", arm, poses=T_base_tcp))
+
+    async def follow(self, arm: str, trajectory: object, what: str, guard: Callable[[], None] | None = None) -> None:
+        await self._answer(self._next("follow", arm, what), guard)
+
+    async def move(
+        self, arm: str, to: Any, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
+    ) -> None:
+        poses = () if isinstance(to, str) else to
+        await self._answer(self._next(*_moved(arm, to, what, plan_only), poses=poses))
+
+    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
+        return await self._answer(self._next("grip", arm, joint, what, poses=(position, effort)))
+
+
+class Requests:
+    """Requests to a robot, one after the other, and what the strategies said meanwhile.
+
+    Attributes:
+        steps: States that were entered.
+        trials: The simulation; None on a recording.
+    """
+
+    def __init__(self, scene: Scene, senses: SimulatedSenses, config: GraspConfig, task: Task | None = None) -> None:
+        self._scene, self._senses, self._config = scene, senses, config
+        self._task = task or Task("nominal", 1, scene, ())
+        self.steps: list[Step] = []
+        self.trials: Trials | None = None
+        self.link: SimulatedRobot | RecordedRobot
+
+    def simulate(self, *, clouds: bool) -> None:
+        """Make the world of the scene."""
+        self.trials = Trials(self._task, self._senses, self._config)
+        self.steps, self.session = self.trials.steps, self.trials.session
+        self.link = SimulatedRobot(self.trials, self._config, clouds=clouds)
+        self.skills = self.trials.skills = Skills(self.link, self._config)
+
+    def replay(self, tape: Tape) -> None:
+        """Take the answers of a recording."""
+        self.link = RecordedRobot(tape, self._config)
+        self.skills = Skills(self.link, self._config)
+        cameras = mounted(load_cameras(), {})
+        self.session = GraspSession(GraspContext.of(self._config, self._scene.table, self.link.description, cameras))
+
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass with nothing asked of the robot."""
+        clock = self.link if self.trials is None else self.trials.robot
+        end_ns = clock.t_ns + round(seconds * 1e9)
+        while clock.t_ns < end_ns:
+            clock.tick()
+
+    def task(self, label: str = "", **request: Any) -> GraspTask:
+        """A request, for a strategy."""
+        asked = GraspRequest(label, **request)
+        if self.trials is not None:
+            return self.trials.grasp_task(asked)
+        return GraspTask(self.session, self.skills, asked, self._report)
+
+    def ask(self, label: str = "", **request: Any) -> GraspOutcome:
+        """Carry out a request."""
+        return self.link.run(carry_out(self.task(label, **request)))
+
+    def restart(self) -> None:
+        """Forget the session, as a node that is started again."""
+        self.session = GraspSession(self.session.context)
+        if self.trials is not None:
+            self.trials.session = self.session
+
+    def pose(self, name: str) -> np.ndarray:
+        """T_world_object (4, 4) of an object now, by ground truth."""
+        tape = self.link.tape
+        x, y, z, *q_xyzw = tape.truth[self.link.now_tick][tape.objects.index(name)]
+        return se3.make(se3.matrix_from_quat_xyzw(np.array(q_xyzw)), (x, y, z))
+
+    @property
+    def said(self) -> str:
+        """The reasons of all steps."""
+        return " ".join(step.reason for step in self.steps)
+
+    def _report(self, status: Status) -> None:
+        entered = (status.state.value, status.previous.value, status.reason, status.attempt)
+        self.steps.append(Step(self.link.t_ns, *entered, status.label, status.arm))
+
+
+class Recordings:
+    """Makes the robot of a test; the value of the fixture `recorded`.
+
+    Args:
+        path: Of the recording of the test, without number and suffix.
+        simulated: Whether a world is simulated instead.
+    """
+
+    def __init__(self, path: Path, *, simulated: bool) -> None:
+        self._path, self._simulated = path, simulated
+        self.made: list[Requests] = []
+
+    def __call__(
+        self,
+        scene: Scene,
+        *,
+        settle: float = 0.5,
+        clouds: bool = True,
+        senses: SimulatedSenses | None = None,
+        config: GraspConfig | None = None,
+        task: Task | None = None,
+    ) -> Requests:
+        """Make a robot with a scene before it.
+
+        Args:
+            scene: What is on the table.
+            settle: Time that passes before the first request, s.
+            clouds: Whether frames have points; a recording without is smaller.
+            senses: How well it sees; noisy depth by default.
+            config: Parameters of the grasp.
+            task: Of which the fault is taken.
+        """
+        senses = senses or SimulatedSenses(depth_noise=True, detector="anything" if clouds else "color")
+        config = config or GraspConfig()
+        made = Requests(scene, senses, config, task)
+        if self._simulated:
+            made.simulate(clouds=clouds)
+        else:
+            path = self._file(len(self.made))
+            if not path.exists():
+                pytest.fail(f"no recording {path.name}; make it: openarm test --record PATH of the test")
+            made.replay(Tape.read(path))
+        self.made.append(made)
+        made.pass_time(settle)
+        return made
+
+    def write(self) -> None:
+        """Write the recordings of what was simulated."""
+        for k, made in enumerate(self.made):
+            assert isinstance(made.link, SimulatedRobot)
+            made.link.tape.write(self._file(k))
+
+    def _file(self, number: int) -> Path:
+        return self._path.with_name(f"{self._path.name}{f'-{number}' if number else ''}.npz")
