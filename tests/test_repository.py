@@ -204,8 +204,12 @@ def test_the_workflow_keeps_wheels_until_a_lock_or_an_interface_changes() -> Non
 @pytest.mark.requirement("R-32")
 def test_ci_runs_the_tests_once_and_repeats_nothing() -> None:
     lines = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-    commands = [line for line in lines if line and not line.startswith("#")]
-    assert commands == ["set -eu", 'exec "$(dirname -- "$0")/../openarm" test "$@"']
+    tests = [line for line in lines if '" test' in line]
+    assert tests == [lines[-1]] == ['exec "$root/openarm" test "$@"']
+    extras = re.search(r"^for extra in (.*); do$", "\n".join(lines), re.M)
+    assert extras is not None
+    locks = {path.stem.removeprefix("requirements-") for path in ROOT.glob("requirements-*.lock")}
+    assert set(extras[1].split()) == locks - {"build", "dev"}, "each lock of an extra is installed, its tests are run"
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     assert not [
         name for name in project["project"]["optional-dependencies"]["test"] if "rerun" in name or "flaky" in name
