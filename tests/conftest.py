@@ -187,9 +187,9 @@ class RosProbe:
             node.destroy_node()
 
 
-@pytest.fixture(scope="module")
-def ros_domain() -> Iterator[int]:
-    """The context of a module in a ROS domain of its own: what other modules left in this process is not met."""
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """A context in a ROS domain of its own: what others left in this process is not met."""
     import rclpy
 
     domain, before = reserve_domain(), os.environ["ROS_DOMAIN_ID"]
@@ -201,6 +201,13 @@ def ros_domain() -> Iterator[int]:
         rclpy.try_shutdown()
         release_domain(domain)
         os.environ["ROS_DOMAIN_ID"] = before  # another process may reserve the released one
+
+
+@pytest.fixture(scope="module")
+def ros_domain() -> Iterator[int]:
+    """The domain that the tests of a module share."""
+    with own_domain() as domain:
+        yield domain
 
 
 @pytest.fixture

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 from action_msgs.msg import GoalStatus
 from control_msgs.action import GripperCommand
@@ -12,6 +14,7 @@ from rclpy.parameter import Parameter
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.ros.node import GraspNode
+from tests.conftest import own_domain
 
 NAME = "/right_gripper_controller/gripper_cmd"
 TYPES = {"parallel": "ParallelGripperCommand", "classic": "GripperCommand"}
@@ -19,6 +22,13 @@ TYPES = {"parallel": "ParallelGripperCommand", "classic": "GripperCommand"}
 
 def client_of(bench) -> ActionClient:
     return ActionClient(bench.ros.node, GripperCommand, NAME)
+
+
+@pytest.fixture
+def ros_domain() -> Iterator[int]:
+    """A domain for each test: one participant cannot serve an action with two types."""
+    with own_domain() as domain:
+        yield domain
 
 
 @pytest.mark.parametrize("position", [0.005, 0.035, 0.025])

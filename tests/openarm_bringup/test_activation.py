@@ -71,7 +71,7 @@ def test_the_daemon_starts_when_it_is_asked_and_again_when_it_has_ended(tmp_path
             return [first, second, int(line)]
 
     pids = asyncio.run(body())
-    wait_gone(pids, 10.0)
+    wait_gone(pids)
     assert len(set(pids)) == 3
     assert not socket_path(os.getpid()).exists()
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -33,6 +33,7 @@ from openarm_common.ros.convert import (
 )
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF, BaseNode
 from openarm_motion.ros.node import MotionNode
+from tests.conftest import own_domain
 
 Result = FollowJointTrajectory.Result
 HZ = 100
@@ -212,6 +213,13 @@ class RobotNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__("fake_robot", Config)
+
+
+@pytest.fixture
+def ros_domain() -> Iterator[int]:
+    """A domain for each test: action servers that a test leaves behind count as there in their participant."""
+    with own_domain() as domain:
+        yield domain
 
 
 @pytest.fixture(scope="module")
