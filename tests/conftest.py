@@ -93,7 +93,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all", action="store_true", help="run the tests that are marked `long`, too")
     parser.addoption(
-        "--record", action="store_true", help="simulate what tests replay, and write it anew; no other test"
+        "--record", action="store_true", help="simulate what tests replay, and write new recordings; no other test"
     )
 
 

@@ -95,7 +95,6 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
     assert json.loads(capsys.readouterr().out)["messages"] == [{"data": "ready"}], "JSON, and nothing else"
     measured = ros2.hz("/ticks", seconds=1.0).data
     assert measured["rate_hz"] > 0.0
-    assert measured["lost"] >= 0
     assert 0.0 <= measured["delay_median_ms"] <= measured["delay_max_ms"]
     assert ros2.pub("/talk", "{data: hello}", count=2, rate=20.0).success
     deadline = time.monotonic() + DEADLINE_S

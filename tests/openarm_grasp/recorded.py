@@ -3,7 +3,7 @@
 
 A recording has each answer of the robot's interface in its order, and the joint states at every tick. The strategies
 run on it as on the robot: they must ask for the same, and find out the same, in a hundredth of the time. What is asked
-otherwise than before fails the test; `openarm test --record PATH` simulates again and writes the recordings anew.
+otherwise than before fails the test; `openarm test --record PATH` simulates again and writes new recordings.
 """
 
 from __future__ import annotations
