@@ -48,17 +48,14 @@ class Up:
         graphs = [graph for graph in json.loads(done.stdout)["graphs"] if graph["pid"] == self.process.pid]
         return graphs[0] if graphs else None
 
-    def wait_ready(self, seconds: float = 60.0) -> dict[str, Any]:
-        """Wait until all nodes are ready."""
-        # Asked for by a process of its own only then: those would slow the start down.
+    def wait_ready(self, seconds: float = 60.0) -> RunRecord:
+        """Wait until all nodes are ready; return what the supervisor has recorded."""
         written = state_dir(self.env) / f"{self.process.pid}.json"
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             assert self.process.poll() is None, self.output.read_text()
-            if written.exists() and RunRecord.model_validate_json(written.read_text()).ready:
-                record = self.record()
-                if record is not None and record["ready"]:
-                    return record
+            if written.exists() and (record := RunRecord.model_validate_json(written.read_text())).ready:
+                return record
             time.sleep(0.05)
         pytest.fail(f"not ready within {seconds:g} s: {self.output.read_text()}")
 

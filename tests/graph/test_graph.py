@@ -54,7 +54,7 @@ def up(start_graph: Any) -> Any:
     return graph
 
 
-@pytest.fixture
+@pytest.fixture(scope="class")
 def visitor(up: Any) -> Iterator[Node]:
     """A node that looks at the graph, spun by tests; when nodes leave, Fast DDS may hold who stays (Fast-DDS#6502)."""
     rclpy.init(domain_id=up.domain)
@@ -96,7 +96,7 @@ def waiting_plan(observer: Observer) -> str | None:
 def kept_of(up: Any, recording: str) -> tuple[dict[str, str], dict[str, int]]:
     """What a flight recording says of itself, and messages by topic."""
     path = Path(recording)
-    assert path.parent == Path(up.record()["run_dir"], "recordings")
+    assert path.parent == Path(up.wait_ready().run_dir, "recordings")
     deadline = time.monotonic() + 60.0
     while not path.exists():
         assert time.monotonic() < deadline, f"{path} is not written"
@@ -117,80 +117,82 @@ def test_one_command_brings_up_every_node(up: Any) -> None:
         assert Path(record["run_dir"], "logs", f"{name}.log").is_file()
 
 
-def test_topics_have_the_stated_type_publishers_and_qos(visitor: Node) -> None:
-    topics = contract.settled(visitor)
-    rows = [row for row in contract.ROW.findall(contract.INTERFACES) if "/msg/" in row[1]]
-    assert len(rows) >= 25
-    assert {name: contract.publishers(visitor, name) for name, _, _ in rows} == contract.stated_publishers()
-    for name, kind, rest in rows:
-        assert topics[name] == [kind], name
-        for info in visitor.get_publishers_info_by_topic(name):
-            qos = (info.qos_profile.reliability, info.qos_profile.durability)
-            assert qos == contract.QOS[rest.split("|")[0].strip()], name
+class TestInterfaces:
+    """What docs/interfaces.md states."""
 
+    def test_topics_have_the_stated_type_publishers_and_qos(self, visitor: Node) -> None:
+        topics = contract.settled(visitor)
+        rows = [row for row in contract.ROW.findall(contract.INTERFACES) if "/msg/" in row[1]]
+        assert len(rows) >= 25
+        assert {name: contract.publishers(visitor, name) for name, _, _ in rows} == contract.stated_publishers()
+        for name, kind, rest in rows:
+            assert topics[name] == [kind], name
+            for info in visitor.get_publishers_info_by_topic(name):
+                qos = (info.qos_profile.reliability, info.qos_profile.durability)
+                assert qos == contract.QOS[rest.split("|")[0].strip()], name
 
-def test_every_topic_is_stated(visitor: Node) -> None:
-    stated = {name for name, _, _ in contract.ROW.findall(contract.INTERFACES)}
-    missing = [name for name in contract.settled(visitor) if name not in stated and not contract.IMPLICIT.search(name)]
-    assert missing == []
+    def test_every_topic_is_stated(self, visitor: Node) -> None:
+        stated = {name for name, _, _ in contract.ROW.findall(contract.INTERFACES)}
+        missing = [
+            name for name in contract.settled(visitor) if name not in stated and not contract.IMPLICIT.search(name)
+        ]
+        assert missing == []
 
+    def test_services_and_actions_have_the_stated_type_and_node(self, visitor: Node) -> None:
+        contract.settled(visitor)
+        rows = {
+            name: (kind, rest.split("|")[0].strip())
+            for name, kind, rest in contract.ROW.findall(contract.INTERFACES)
+            if "/msg/" not in kind
+        }
+        assert len(rows) >= 14
+        found = contract.until(visitor, lambda: contract.services(visitor), lambda found: found == rows)
+        assert found == rows
 
-def test_services_and_actions_have_the_stated_type_and_node(visitor: Node) -> None:
-    contract.settled(visitor)
-    rows = {
-        name: (kind, rest.split("|")[0].strip())
-        for name, kind, rest in contract.ROW.findall(contract.INTERFACES)
-        if "/msg/" not in kind
-    }
-    assert len(rows) >= 14
-    found = contract.until(visitor, lambda: contract.services(visitor), lambda found: found == rows)
-    assert found == rows
+    def test_parameters_exist_at_their_nodes(self, visitor: Node) -> None:
+        stated = contract.stated_parameters()
+        assert {"mujoco_bridge", "detector", "octomap", "motion", "grasp"} <= stated.keys()
+        for node, names in stated.items():
+            client = visitor.create_client(ListParameters, f"/{node}/list_parameters")
+            assert client.wait_for_service(timeout_sec=60.0), node
+            answer = client.call_async(ListParameters.Request())
+            rclpy.spin_until_future_complete(visitor, answer, timeout_sec=60.0)
+            assert answer.done(), f"no answer of {node}"
+            assert names <= set(answer.result().result.names), node
 
+    @pytest.mark.requirement("P-31")
+    def test_who_takes_images_unasked_is_a_lifecycle_node(self, visitor: Node) -> None:
+        contract.settled(visitor)
+        managed = {
+            node
+            for name, (kind, node) in contract.services(visitor).items()
+            if kind == "lifecycle_msgs/srv/ChangeState"
+        }
+        assert managed == {"octomap", "flight_recorder"}
+        for topic in ("/overhead/color/image_raw", "/overhead/depth/image_raw", "/wrist/depth/image_raw"):
+            taking = {info.node_name for info in visitor.get_subscriptions_info_by_topic(topic)}
+            assert taking <= managed, topic
 
-def test_parameters_exist_at_their_nodes(visitor: Node) -> None:
-    stated = contract.stated_parameters()
-    assert {"mujoco_bridge", "detector", "octomap", "motion", "grasp"} <= stated.keys()
-    for node, names in stated.items():
-        client = visitor.create_client(ListParameters, f"/{node}/list_parameters")
-        assert client.wait_for_service(timeout_sec=60.0), node
-        answer = client.call_async(ListParameters.Request())
-        rclpy.spin_until_future_complete(visitor, answer, timeout_sec=60.0)
-        assert answer.done(), f"no answer of {node}"
-        assert names <= set(answer.result().result.names), node
+    @pytest.mark.requirement("A-73")
+    def test_one_publisher_for_each_edge_of_the_frame_tree(self, visitor: Node) -> None:
+        parents: dict[str, set[tuple[str, str]]] = {}
 
+        def note(kind: str, message: TFMessage) -> None:
+            for edge in message.transforms:
+                parents.setdefault(edge.child_frame_id, set()).add((edge.header.frame_id, kind))
 
-@pytest.mark.requirement("P-31")
-def test_who_takes_images_unasked_is_a_lifecycle_node(visitor: Node) -> None:
-    contract.settled(visitor)
-    managed = {
-        node for name, (kind, node) in contract.services(visitor).items() if kind == "lifecycle_msgs/srv/ChangeState"
-    }
-    assert managed == {"octomap", "flight_recorder"}
-    for topic in ("/overhead/color/image_raw", "/overhead/depth/image_raw", "/wrist/depth/image_raw"):
-        taking = {info.node_name for info in visitor.get_subscriptions_info_by_topic(topic)}
-        assert taking <= managed, topic
-
-
-@pytest.mark.requirement("A-73")
-def test_one_publisher_for_each_edge_of_the_frame_tree(visitor: Node) -> None:
-    parents: dict[str, set[tuple[str, str]]] = {}
-
-    def note(kind: str, message: TFMessage) -> None:
-        for edge in message.transforms:
-            parents.setdefault(edge.child_frame_id, set()).add((edge.header.frame_id, kind))
-
-    taken = [
-        visitor.create_subscription(TFMessage, "/tf", lambda m: note("/tf", m), QOS_TF),
-        visitor.create_subscription(TFMessage, "/tf_static", lambda m: note("/tf_static", m), QOS_STATIC_TF),
-    ]
-    wanted = {"overhead_color_optical_frame", "wrist_link", "openarm_right_hand_tcp", "openarm_left_link7", "table"}
-    contract.until(visitor, parents.keys, lambda found: wanted <= found)
-    for subscription in taken:
-        visitor.destroy_subscription(subscription)
-    assert wanted <= parents.keys()
-    assert {child: edges for child, edges in parents.items() if len(edges) > 1} == {}
-    roots = {parent for edges in parents.values() for parent, _ in edges} - parents.keys()
-    assert roots == {"world"}
+        taken = [
+            visitor.create_subscription(TFMessage, "/tf", lambda m: note("/tf", m), QOS_TF),
+            visitor.create_subscription(TFMessage, "/tf_static", lambda m: note("/tf_static", m), QOS_STATIC_TF),
+        ]
+        wanted = {"overhead_color_optical_frame", "wrist_link", "openarm_right_hand_tcp", "openarm_left_link7", "table"}
+        contract.until(visitor, parents.keys, lambda found: wanted <= found)
+        for subscription in taken:
+            visitor.destroy_subscription(subscription)
+        assert wanted <= parents.keys()
+        assert {child: edges for child, edges in parents.items() if len(edges) > 1} == {}
+        roots = {parent for edges in parents.values() for parent, _ in edges} - parents.keys()
+        assert roots == {"world"}
 
 
 @pytest.mark.requirement("R-24")
@@ -204,15 +206,23 @@ def test_unknown_object_is_refused_with_what_is_in_view_and_leaves_a_recording(u
     assert custom["again"] == "openarm pick unicorn"
     assert (custom["graph"], "openarm-vision" in custom) == ("sim", True)
     assert {"/tf_static", "/robot_description", "/octomap_binary", "/grasp/status", "/detections_3d"} <= counts.keys()
-    checked = check(Path(answer.recording))
+
+
+@pytest.mark.long
+@pytest.mark.requirement("R-24")
+def test_a_recording_of_a_failure_is_checked_and_replayed(up: Any, domain: int) -> None:
+    recording = call(domain, Grasp, "/grasp", label="unicorn").recording
+    _, counts = kept_of(up, recording)
+    checked = check(Path(recording))
     assert checked.success, checked.message
     assert checked.data["again"] == "openarm pick unicorn"
     assert checked.data["numbers"]["detection/overhead/red/frames"] > 0
-    done = up.openarm("replay", answer.recording, "--rate", "0", "--domain", str(reserve_domain()), "--json")
+    done = up.openarm("replay", recording, "--rate", "0", "--domain", str(reserve_domain()), "--json")
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(done.stdout)["messages"] == sum(counts.values())
 
 
+@pytest.mark.long
 def test_dry_run_plans_and_moves_nothing(up: Any, observer: Observer) -> None:
     scene = load_scene("demo")
     wait_scene(observer, scene, 0)
@@ -224,6 +234,7 @@ def test_dry_run_plans_and_moves_nothing(up: Any, observer: Observer) -> None:
     assert max(float(abs(sample.p_world - track[0].p_world).max()) for sample in track) < 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-32", "R-15")
 def test_with_wrong_intrinsics_a_grasp_is_refused_with_that_code_and_nothing_moves(
     domain: int, observer: Observer
@@ -298,7 +309,7 @@ def test_bridge_killed_during_a_grasp_is_a_named_code_and_the_graph_comes_back(
 ) -> None:
     after_ns = observer.reset_world("demo", 0)
     wait_scene(observer, load_scene("demo"), after_ns)
-    bridge = up.record()["nodes"]["mujoco_bridge"]["pid"]
+    bridge = up.node("mujoco_bridge").pid
     request = Asked(observer, lambda: client.pick("red"))
     request.wait_state("MOVE_TO_GRASP")
     os.kill(bridge, signal.SIGKILL)
@@ -308,10 +319,8 @@ def test_bridge_killed_during_a_grasp_is_a_named_code_and_the_graph_comes_back(
     assert not result.success
     assert result.code in LOST, f"{result.code}: {result.message}"
     assert seconds < 2.0
-    deadline = time.monotonic() + 60.0
-    while (record := up.wait_ready())["nodes"]["mujoco_bridge"]["pid"] == bridge:
-        assert time.monotonic() < deadline
-    assert record["nodes"]["mujoco_bridge"]["restarts"] == 1
+    up.wait_back("mujoco_bridge", bridge)
+    assert up.node("mujoco_bridge").restarts == 1
     custom, counts = kept_of(up, result.recording)
     assert custom["reason"].startswith(f"{result.code}: ")
     assert custom["again"] == "openarm pick red"

@@ -42,7 +42,7 @@ def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_hold
     control = start_graph("control", *(word for setting in quick for word in ("--set", setting)))
     vision = start_graph(str(eyes), joining=control)
     control.wait_ready()
-    nodes = vision.wait_ready()["nodes"]
+    nodes = vision.wait_ready().nodes
     done = control.openarm("pick", "red", "--json", timeout=200.0)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -57,7 +57,7 @@ def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_hold
         request = Asked(observer, lambda: client.pick("blue"))
         request.wait_state("MOVE_TO_PREGRASP")
         for name in ("detector", "wrist_detector"):
-            os.kill(nodes[name]["pid"], signal.SIGKILL)
+            os.kill(nodes[name].pid, signal.SIGKILL)
         result = request.result(timeout=90.0)
         assert not result.success
         assert result.code in (Code.STALE_DATA, Code.NOT_READY), f"{result.code}: {result.message}"
