@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 #: Each test writes when it was at work, s.
 FILE = """
@@ -25,6 +27,7 @@ def test_of_some_time(k):
 """
 
 
+@pytest.mark.long
 def test_a_test_marked_alone_runs_alone_and_the_others_run_in_parallel(tmp_path: Path) -> None:
     """Also between two tests of a file, whose module fixtures are in place then, too."""
     marks = {"a": "", "b": "", "c": "", "d": "@pytest.mark.alone", "e": "@pytest.mark.alone"}

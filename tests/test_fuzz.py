@@ -32,7 +32,7 @@ from openarm_motion.ros import convert as motion
 @pytest.mark.requirement("R-22")
 @pytest.mark.parametrize("kind", KINDS)
 def test_altered_files_are_read_or_refused_in_a_sentence(kind: str) -> None:
-    tally = read_altered(kind, 8 if kind == "contents" else 60, 11)
+    tally = read_altered(kind, 4 if kind == "contents" else 30, 11)
     assert not tally.raw, tally.raw
     assert not tally.hangs
     assert tally.worst_mib < BOUND_MIB

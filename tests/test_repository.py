@@ -24,36 +24,7 @@ from openarm_sim_bridge.faults.faults import FAULTS
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = sorted(path.name for path in ROOT.glob("openarm_*") if (path / "__init__.py").exists())
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md"))]
-#: Message packages that a wheel of ROS 2 brings, and those that `interfaces/` brings.
-FROM_WHEELS = {
-    "shape_msgs",
-    "action_msgs",
-    "builtin_interfaces",
-    "diagnostic_msgs",
-    "geometry_msgs",
-    "nav_msgs",
-    "rcl_interfaces",
-    "rosgraph_msgs",
-    "sensor_msgs",
-    "std_msgs",
-    "std_srvs",
-    "trajectory_msgs",
-    "unique_identifier_msgs",
-    "visualization_msgs",
-}
 FROM_INTERFACES = {path.parent.name for path in (ROOT / "interfaces").glob("*/package.xml")}
-
-
-def _message_packages(package: str) -> set[str]:
-    """Message packages that the modules of a package import."""
-    found: set[str] = set()
-    for path in (ROOT / package).rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                top, _, kind = node.module.partition(".")
-                if kind in ("msg", "srv", "action") and top != "rclpy":
-                    found.add(top)
-    return found
 
 
 @pytest.mark.requirement("A-02")
@@ -83,13 +54,6 @@ def test_ros_2_jazzy_on_the_pythons_it_has_wheels_for() -> None:
     assert (3, 11) <= sys.version_info[:2] <= (3, 13)
     rclpy = importlib.metadata.version("ros-jazzy-rclpy")
     assert rclpy.split(".")[0] == "7", f"rclpy {rclpy} is not Jazzy's"
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-@pytest.mark.requirement("A-09")
-def test_messages_come_from_wheels_or_from_interfaces(package: str) -> None:
-    unknown = _message_packages(package) - FROM_WHEELS - FROM_INTERFACES
-    assert unknown == set(), f"{package} needs an apt ROS for {', '.join(sorted(unknown))}"
 
 
 def _view_world(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:

@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import ast
 import re
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -21,21 +19,14 @@ ROWS = {
 PLANNED = {id_ for id_, (_, mark) in ROWS.items() if "planned" in mark}
 
 
-def requirements_of_tests() -> Counter[str]:
-    """Count the requirement ids that tests carry as markers, without running any test."""
-    return Counter(
-        argument.value
-        for path in TESTS.rglob("test_*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.mark.requirement"
-        for argument in node.args
-        if isinstance(argument, ast.Constant) and isinstance(argument.value, str)
-    )
-
-
 @pytest.fixture(scope="module")
 def tested() -> set[str]:
-    return set(requirements_of_tests())
+    """The requirement ids that tests carry as markers, without running any test."""
+    marks = (
+        re.findall(r"^[^#\n]*pytest\.mark\.requirement\(([^)]*)\)", path.read_text(encoding="utf-8"), re.M)
+        for path in TESTS.rglob("test_*.py")
+    )
+    return set(re.findall(r'"([A-Z]-\d+)"', " ".join(mark for found in marks for mark in found)))
 
 
 def test_the_page_lists_each_id_once_and_in_order() -> None:
@@ -45,10 +36,8 @@ def test_the_page_lists_each_id_once_and_in_order() -> None:
     assert listed == list(ROWS)
 
 
-@pytest.mark.parametrize("area", ["A", "B", "P", "N", "R"])
-def test_each_requirement_has_a_test(tested: set[str], area: str) -> None:
-    missing = [f"{id_}: {text}" for id_, (text, _) in ROWS.items() if id_[0] == area and id_ not in tested | PLANNED]
-    assert missing == []
+def test_each_requirement_has_a_test(tested: set[str]) -> None:
+    assert [f"{id_}: {text}" for id_, (text, _) in ROWS.items() if id_ not in tested | PLANNED] == []
 
 
 def test_no_test_carries_an_unknown_id(tested: set[str]) -> None:

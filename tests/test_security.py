@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 from pathlib import Path
 
@@ -19,5 +18,5 @@ def test_each_promise_names_tests_that_exist() -> None:
         assert named, promise
         assert len(named) == tests.count("`") // 2, promise
         for path, test in named:
-            tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
-            assert test in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, f"{path}::{test}"
+            text = (ROOT / path).read_text(encoding="utf-8")
+            assert re.search(rf"^(async )?def {test}\(", text, re.MULTILINE), f"{path}::{test}"

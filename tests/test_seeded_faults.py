@@ -35,6 +35,7 @@ def test_a_fault_applies_and_its_tests_exist(fault: Fault) -> None:
     assert all((ROOT / test).exists() for test in fault.tests)
 
 
+@pytest.mark.long
 def test_what_tests_notice_is_caught_but_not_by_a_test_that_fails_anyway(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

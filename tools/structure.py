@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import functools
 import io
 import re
 import subprocess
@@ -93,30 +94,35 @@ def packages(root: Path) -> list[str]:
     return sorted(path.parent.name for path in root.glob("openarm_*/__init__.py"))
 
 
-def imported_names(path: Path) -> dict[str, int]:
-    """Return the absolute names that a module imports, with the line; imports for type checking are left out.
+@functools.cache
+def imports(path: Path) -> tuple[tuple[str, int, bool], ...]:
+    """Return the absolute names that a module imports, each with its line and whether it is for type checking only.
 
     Raises:
         ValueError: The module has a relative import.
     """
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
+    nodes = list(ast.walk(ast.parse(text)))
     for_types = {
         id(inner)
-        for node in ast.walk(tree)
+        for node in (nodes if "TYPE_CHECKING" in text else ())
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
         for inner in ast.walk(node)
     }
-    found: dict[str, int] = {}
-    for node in ast.walk(tree):
-        if id(node) in for_types:
-            continue
+    found: list[tuple[str, int, bool]] = []
+    for node in nodes:
         if isinstance(node, ast.Import):
-            found.update({alias.name: node.lineno for alias in node.names})
+            found += [(alias.name, node.lineno, id(node) in for_types) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             if node.level:
                 raise ValueError(f"{path}:{node.lineno}: relative import; write the name of the package")
-            found.update({f"{node.module}.{alias.name}": node.lineno for alias in node.names})
-    return found
+            found += [(f"{node.module}.{alias.name}", node.lineno, id(node) in for_types) for alias in node.names]
+    return tuple(found)
+
+
+def imported_names(path: Path) -> dict[str, int]:
+    """Return the names that a module imports, with the line; imports for type checking are left out."""
+    return {name: line for name, line, for_types in imports(path) if not for_types}
 
 
 def module_imports(root: Path, package: str) -> dict[str, set[str]]:

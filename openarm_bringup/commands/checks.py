@@ -100,11 +100,9 @@ def completion(shell: Literal["bash", "zsh", "fish"] = "bash", *, install: bool 
 def _in_order(tests: Path) -> list[str]:
     """Return the test files: those that wait evenly among those that compute, of each kind the longest first.
 
-    A long one that came last would keep one process busy and the others waiting. Those with a test that is marked long
-    come first, then those with most text.
+    A long one that came last would keep one process busy and the others waiting. What has most text counts as longest.
     """
-    texts = {path: path.read_bytes() for path in tests.rglob("test_*.py")}
-    files = sorted(texts, key=lambda path: (b"mark.long" not in texts[path], -len(texts[path]), path))
+    files = sorted(tests.rglob("test_*.py"), key=lambda path: (-path.stat().st_size, path))
     kinds = [path.relative_to(tests).parts[0] in WAITING for path in files]
     ranks = [kinds[:k].count(kind) / kinds.count(kind) for k, kind in enumerate(kinds)]
     return [str(path.relative_to(tests.parent)) for _, path in sorted(zip(ranks, files, strict=True))]

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from openarm_bringup.supervision.environment import node_arguments
-from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.graph import graph_names, load_graph
 from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 
@@ -103,3 +103,11 @@ def test_views_show_topics_that_are_offered_as_they_are_offered(stage: str) -> N
         quality = offered[topic["Value"]].strip()
         assert (topic["Reliability Policy"] == "Best Effort") == (quality == "best effort"), topic["Value"]
         assert (topic["Durability Policy"] == "Transient Local") == (quality == "latched"), topic["Value"]
+
+
+def test_every_node_of_the_graphs_is_an_executable_of_its_package() -> None:
+    """What `ros2 run` and a launch file start is what the graph starts."""
+    modules = {spec.module for name in graph_names() for spec in load_graph(name).nodes.values() if spec.module}
+    for module in modules - {"openarm_bringup.ros.script_node"}:
+        package = module.partition(".")[0]
+        assert f"{module}:main" in (ROOT / package / "setup.py").read_text(encoding="utf-8"), module

@@ -4,25 +4,32 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
 import pytest
 
 SIDE = "right"
+#: Simulated seconds a second, where no camera is drawn.
+SPEED = 4.0
 
 
-@pytest.fixture(autouse=True)
-def frequent_reports(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def frequent_reports() -> Iterator[None]:
     """Nodes report on /diagnostics ten times a second, so that no test waits for the next report."""
     from openarm_common.ros.node import BaseNode
 
-    monkeypatch.setattr(BaseNode, "REPORT_PERIOD_S", 0.1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(BaseNode, "REPORT_PERIOD_S", 0.1)
+        yield
 
 
 class Bench:
-    """A bridge, whose arms are ideal where nothing else is asked for, and what has been heard from it.
+    """A bridge, and what has been heard from it.
+
+    Where nothing else is asked for, its arms are ideal, and simulated time without cameras goes as fast as it can be
+    followed: joint states come 100 times a second of wall time then.
 
     Joint values of the right arm, rad.
     """
@@ -33,22 +40,32 @@ class Bench:
     HOME = (-0.2, 2.2, 0.0, 1.2, 0.0, 0.0, 0.4)
     NEAR_HOME = (-0.1, 2.1, 0.1, 1.3, 0.1, 0.1, 0.3)
 
-    def __init__(self, ros, **parameters: object) -> None:
+    def __init__(self, ros, node=None, **parameters: object) -> None:
         # Here, so that the tests of other nodes do not pay for it.
-        from rclpy.parameter import Parameter
         from sensor_msgs.msg import JointState
 
         from openarm_common.ros.node import QOS_COMMAND
-        from openarm_sim_bridge.ros.node import MujocoBridge
 
         self.ros = ros
-        parameters = {"profile": "ideal", **parameters}
-        overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
-        self.node = ros.add(MujocoBridge(parameter_overrides=overrides))
+        self.node = node or ros.add(self.made(**parameters))
         self.joints: list[JointState] = []
         self.joint_arrivals: list[float] = []
         ros.node.create_subscription(JointState, "/joint_states", self._on_joints, QOS_COMMAND)
         ros.spin_until(lambda: self.joints, what="a joint state")
+
+    @staticmethod
+    def made(**parameters: object):
+        """A bridge with parameters; a dot in a name is written __."""
+        from rclpy.parameter import Parameter
+
+        from openarm_sim_bridge.ros import node
+
+        faster = {"speed": SPEED} if parameters.get("images") is False and "controllers" not in parameters else {}
+        values = {"profile": "ideal", **faster, **parameters}
+        overrides = [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(node, "REPORT_PERIOD_S", 0.1)
+            return node.MujocoBridge(parameter_overrides=overrides)
 
     def _on_joints(self, message) -> None:
         self.joints.append(message)
@@ -100,6 +117,12 @@ class Bench:
         from openarm_interfaces.srv import ClearFaults
 
         answer = self.call(ClearFaults, "/sim/clear_faults", name=name)
+        assert answer.success, answer.message
+
+    def reset(self, **fields: object) -> None:
+        from openarm_interfaces.srv import ResetWorld
+
+        answer = self.call(ResetWorld, "/sim/reset_world", **fields)
         assert answer.success, answer.message
 
     # --- actions
@@ -178,7 +201,21 @@ def bench(bridge) -> Bench:
     return bridge(images=False)
 
 
+@pytest.fixture(scope="module")
+def drawn(ros_domain: int) -> Iterator[object]:
+    """A bridge with cameras, which the tests of a module share."""
+    node = Bench.made()
+    yield node
+    node.close()
+    node.destroy_node()
+
+
 @pytest.fixture
-def seeing(bridge) -> Bench:
-    """With cameras."""
-    return bridge()
+def seeing(ros, drawn) -> Iterator[Bench]:
+    """With cameras, in the world of the beginning."""
+    ros.executor.add_node(drawn)
+    bench = Bench(ros, drawn)
+    yield bench
+    bench.clear()
+    bench.reset()
+    ros.executor.remove_node(drawn)

@@ -95,7 +95,8 @@ class Bench:
         self.ros, self.camera = ros, camera
         if mounted:
             camera.publish_mount()
-        values = {"camera": camera.config.name, **params}
+        # no joint states come for a camera that is fixed, and its frames do not wait for them
+        values = {"camera": camera.config.name, "transform_wait": 0.02, **params}
         self.node = ros.add(DetectNode(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()]))
         self.watch = Watch(ros, Detection3DArray, "/detections_3d")
         self.diagnostics = Watch(ros, DiagnosticArray, "/diagnostics")
@@ -107,7 +108,7 @@ class Bench:
         self.camera.publish(self.t_ns, **replace)
 
     def pump(self, condition, what: str, **make) -> None:
-        """Publish a frame, and another every half second (best effort may lose one), until `condition` holds.
+        """Publish a frame, and another every tenth of a second (best effort may lose one), until `condition` holds.
 
         `make` gives functions of the stamp that replace the message of a stream.
         """
@@ -116,7 +117,7 @@ class Bench:
         def step() -> bool:
             nonlocal due
             if time.monotonic() >= due:
-                due = time.monotonic() + 0.5
+                due = time.monotonic() + 0.1
                 t_ns = self.t_ns + 200 * MS
                 self.frame(**{stream: message(t_ns) for stream, message in make.items()})
             return condition()

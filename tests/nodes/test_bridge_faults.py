@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each fault that can be injected, seen on the wire; and that it ends when it is cleared."""
+"""Each fault of robot and world that can be injected, seen on the wire; and that it ends when it is cleared."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,10 +9,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from openarm_interfaces.msg import ObjectStateArray
 from openarm_interfaces.srv import ClearFaults, InjectFault, MoveObject, RemoveObject
-from sensor_msgs.msg import CameraInfo, Image, JointState
+from sensor_msgs.msg import JointState
 
-from openarm_common.ros.convert import image_to_array, stamp_to_ns
-from openarm_common.ros.node import QOS_COMMAND, QOS_SENSOR, reliable
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.node import QOS_COMMAND, reliable
 from openarm_sim_bridge.faults.faults import FAULTS
 
 FINGER = "openarm_right_finger_joint1"
@@ -25,102 +23,9 @@ def stamps(messages: list) -> np.ndarray:
     return np.array([stamp_to_ns(m.header.stamp) for m in messages])
 
 
-# --- cameras
-def test_camera_drop_delay_and_freeze(seeing) -> None:
-    images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
-    seeing.fresh(images, 5)
-    seeing.inject("camera_drop", "{camera: overhead, share: 1.0}")
-    count, since_ns = len(images), seeing.t_ns
-
-    def quiet() -> bool:
-        """Whether no image has come for half a second of simulated time."""
-        nonlocal count, since_ns
-        if len(images) != count:
-            count, since_ns = len(images), seeing.t_ns
-        return seeing.t_ns > since_ns + 500_000_000
-
-    seeing.ros.spin_until(quiet, what="the end of the images")
-    seeing.inject("camera_drop", "{camera: wrist, share: 1.0}")  # takes the new values
-    seeing.fresh(images, 2)
-    seeing.clear()
-    # Late: the newest image is older than the newest joint state by the delay.
-    late: list[int] = []
-    seeing.ros.node.create_subscription(
-        Image, "/overhead/color/image_raw", lambda m: late.append(seeing.t_ns - stamp_to_ns(m.header.stamp)), QOS_SENSOR
-    )
-    seeing.inject("camera_delay", "{seconds: 0.6}")
-    seeing.spin_sim(1.0)
-    late.clear()
-    seeing.ros.spin_until(lambda: len(late) > 5, what="late images")
-    assert np.median(late) > 0.45e9
-    seeing.clear("camera_delay")
-    seeing.spin_sim(1.0)
-    # Frozen: the cube is moved, the picture is not; stamps go on.
-    seeing.inject("camera_freeze")
-    (before,) = seeing.fresh(images)[:1]
-    pose = PoseStamped()
-    pose.pose.position.x, pose.pose.position.y = 0.30, -0.05
-    assert seeing.call(MoveObject, "/sim/move_object", name="red_cube", pose=pose).success
-    later = seeing.fresh(images, 3)[-1]
-    assert stamp_to_ns(later.header.stamp) > stamp_to_ns(before.header.stamp)
-    assert bytes(later.data) == bytes(before.data)
-    seeing.clear()
-    assert bytes(seeing.fresh(images, 3)[-1].data) != bytes(before.data)
-
-
-@pytest.mark.requirement("A-72")
-def test_stamp_offset_and_intrinsics_bias(seeing) -> None:
-    infos = seeing.collect(CameraInfo, "/overhead/depth/camera_info", QOS_SENSOR)
-    true = seeing.fresh(infos)[0]
-    assert np.all(stamps(infos[-3:]) % 10_000_000 == 0)
-    seeing.inject("stamp_offset", "{ms: 23}")
-    seeing.ros.spin_until(lambda: stamps(infos[-1:])[0] % 10_000_000 == 3_000_000, what="stamps with an offset")
-    assert np.all(stamps(seeing.fresh(infos, 3)) % 10_000_000 == 3_000_000)
-    seeing.inject("intrinsics_bias", "{focal: 0.05, cx: 4.0}")
-    seeing.ros.spin_until(lambda: infos[-1].k[0] != true.k[0], what="wrong intrinsics")
-    wrong = infos[-1]
-    np.testing.assert_allclose([wrong.k[0], wrong.k[4]], [1.05 * true.k[0], 1.05 * true.k[4]])
-    assert wrong.k[2] == pytest.approx(true.k[2] + 4.0)
-    assert wrong.p[0] == wrong.k[0]
-    seeing.clear()
-    seeing.ros.spin_until(lambda: list(infos[-1].k) == list(true.k), what="the true intrinsics")
-    seeing.ros.spin_until(lambda: stamps(infos[-1:])[0] % 10_000_000 == 0, what="stamps without an offset")
-
-
-def test_mount_knocked_light_and_depth_patch(seeing) -> None:
-    images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
-    depths = seeing.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
-
-    def shown(got: list, shows: Callable[[np.ndarray], object], what: str) -> np.ndarray:
-        """The first picture in which it shows."""
-        seeing.ros.spin_until(lambda: got and shows(image_to_array(got[-1]).astype(float)), what=what)
-        return image_to_array(got[-1]).astype(float)
-
-    def same(one: np.ndarray, other: np.ndarray, atol: float) -> bool:
-        return bool(np.allclose(one, other, atol=atol))
-
-    seeing.fresh(depths, 2), seeing.fresh(images, 2)
-    plain_depth, plain = (image_to_array(got[-1]).astype(float) for got in (depths, images))
-    seeing.inject("depth_patch", "{u: 300, v: 220, width: 40, height: 20, metres: -0.05}")
-    change = shown(depths, lambda d: not same(d, plain_depth, 1.0), "the patch") - plain_depth
-    np.testing.assert_allclose(change[220:240, 300:340], -50.0, atol=1.0)
-    assert np.abs(change[:200]).max() <= 1.0
-    seeing.clear()
-    seeing.inject("light_changed", "{scale: 0.3}")
-    shown(images, lambda c: c[100:].mean() < 0.6 * plain[100:].mean(), "less light")
-    seeing.clear()
-    shown(depths, lambda d: same(d, plain_depth, 1.0), "the depth without the patch")
-    seeing.inject("mount_knocked", "{camera: overhead, mm: 20, deg: 3}", seed=5)
-    knocked = shown(depths, lambda d: np.abs(d - plain_depth).mean() > 3.0, "the knock")
-    seeing.inject("mount_knocked", "{camera: overhead, mm: 20, deg: 3}", seed=5)
-    np.testing.assert_allclose(image_to_array(seeing.fresh(depths, 3)[-1]), knocked, atol=1.0)  # the same seed
-    seeing.clear()
-    shown(depths, lambda d: same(d, plain_depth, 1.0), "the true mount in depth")
-    shown(images, lambda c: same(c, plain, 2.0), "the true mount and light in colour")
-
-
 # --- robot and world
-def test_joint_state_gap(bench) -> None:
+def test_joint_state_gap(bridge) -> None:
+    bench = bridge(images=False, speed=1.0)  # publishes each tick
     states = bench.collect(JointState, "/joint_states", reliable(2000))  # a starved probe misses none
 
     def gaps_ms(seconds: float) -> np.ndarray:
@@ -131,10 +36,10 @@ def test_joint_state_gap(bench) -> None:
         heard = stamps(states)
         return np.diff(heard[heard >= begin]) * 1e-6
 
-    bench.inject("joint_state_gap", "{ms: 150, every: 0.5}", seed=3)
-    assert 3 <= np.sum(gaps_ms(2.0) >= 140) <= 5
+    bench.inject("joint_state_gap", "{ms: 150, every: 0.25}", seed=3)
+    assert 3 <= np.sum(gaps_ms(1.0) >= 140) <= 5
     bench.clear()
-    assert gaps_ms(1.0).max() < 100
+    assert gaps_ms(0.5).max() < 100
 
 
 def test_object_nudged(bench) -> None:
@@ -213,9 +118,8 @@ def test_joint_late(bench) -> None:
 
 
 # --- asking
-@pytest.mark.parametrize(
-    ("fields", "parts"),
-    [
+def test_a_wrong_fault_is_answered_with_what_there_is(bench) -> None:
+    for fields, parts in (
         ({"name": "gremlin"}, ["gremlin", *FAULTS]),
         ({"name": "camera_drop", "parameters": "{share: 2.0}"}, ["share", "2.0"]),
         ({"name": "camera_drop", "parameters": "{shade: 0.2}"}, ["shade", "share"]),
@@ -224,13 +128,11 @@ def test_joint_late(bench) -> None:
         ({"name": "camera_drop", "seed": -1}, ["seed"]),
         ({"name": "gripper_weak", "parameters": "{side: middle}"}, ["left", "right", "both"]),
         ({"name": "camera_drop"}, ["no cameras"]),
-    ],
-)
-def test_a_wrong_fault_is_answered_with_what_there_is(bench, fields: dict, parts: list[str]) -> None:
-    answer = bench.call(InjectFault, "/sim/inject_fault", **fields)
-    assert not answer.success
-    for part in parts:
-        assert part in answer.message
+    ):
+        answer = bench.call(InjectFault, "/sim/inject_fault", **fields)
+        assert not answer.success
+        for part in parts:
+            assert part in answer.message
     assert not bench.call(ClearFaults, "/sim/clear_faults", name="gremlin").success
 
 

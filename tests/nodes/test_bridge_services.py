@@ -40,7 +40,7 @@ def test_pause_and_step(bench) -> None:
 
 @pytest.mark.requirement("P-25")
 def test_reset_puts_the_robot_back_and_aborts_what_runs(bench) -> None:
-    _, future = bench.follow(bench.goal((6.0, bench.NEAR_HOME)))
+    _, future = bench.follow(bench.goal((60.0, bench.NEAR_HOME)))
     bench.spin_sim(1.5)
     before = bench.t_ns
     answer = bench.call(ResetWorld, "/sim/reset_world")
@@ -109,7 +109,7 @@ def test_a_diverged_world_takes_no_command_until_it_is_reset(bench, tmp_path, mo
     simulation = bench.node._simulation
     monkeypatch.setattr(simulation, "_dump_folder", tmp_path)
     got = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
-    _, running = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
+    _, running = bench.follow(bench.goal((60.0, bench.NEAR_HOME)))
     bench.spin_sim(0.3)
     simulation.call(lambda: simulation.world.data.qvel.fill(np.nan))
     answer = bench.ros.result(running)

@@ -18,83 +18,32 @@ from diagnostic_msgs.msg import DiagnosticArray
 from openarm_interfaces.msg import ObjectStateArray
 from rclpy.action import ActionClient
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, Imu, JointState
 from std_msgs.msg import Float64, String
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.convert import (
-    stamp_to_ns,
-    transform_to_matrix,
-    xyz,
-)
+from openarm_common.ros.convert import image_to_array, stamp_to_ns, transform_to_matrix, xyz
 from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
 from openarm_control.ros.robot_publisher import JOINT_STATE_DEADLINE
+from tests.nodes.conftest import Bench
 
 
-@pytest.mark.requirement("A-04", "A-15", "A-16", "A-17")
-def test_names_types_and_qos(seeing) -> None:
-    node = seeing.ros.node
-    assert "mujoco_bridge" in node.get_node_names()
-    offered = {
-        "/clock": ("rosgraph_msgs/msg/Clock", False, False),
-        "/joint_states": ("sensor_msgs/msg/JointState", True, False),
-        "/robot_description": ("std_msgs/msg/String", True, True),
-        "/tf": ("tf2_msgs/msg/TFMessage", True, False),
-        "/tf_static": ("tf2_msgs/msg/TFMessage", True, True),
-        "/overhead/color/image_raw": ("sensor_msgs/msg/Image", False, False),
-        "/overhead/color/camera_info": ("sensor_msgs/msg/CameraInfo", False, False),
-        "/overhead/depth/image_raw": ("sensor_msgs/msg/Image", False, False),
-        "/overhead/depth/camera_info": ("sensor_msgs/msg/CameraInfo", False, False),
-        "/wrist/color/image_raw": ("sensor_msgs/msg/Image", False, False),
-        "/wrist/depth/image_raw": ("sensor_msgs/msg/Image", False, False),
-        "/spectator/color/image_raw": ("sensor_msgs/msg/Image", False, False),
-        "/sim/ground_truth/objects": ("openarm_interfaces/msg/ObjectStateArray", True, False),
-        "/sim/real_time_factor": ("std_msgs/msg/Float64", True, False),
-        "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", True, False),
-    }
-
-    def publishers(topic: str) -> list:
-        owner = "mujoco_cameras" if topic.startswith(("/overhead", "/wrist", "/spectator")) else "mujoco_bridge"
-        return [info for info in node.get_publishers_info_by_topic(topic) if info.node_name == owner]
-
-    seeing.ros.spin_until(lambda: all(map(publishers, offered)), what="every publisher of bridge and cameras")
-    for topic, (kind, is_reliable, latched) in offered.items():
-        (info,) = publishers(topic)
-        assert info.topic_type == kind, topic
-        assert (info.qos_profile.reliability == ReliabilityPolicy.RELIABLE) == is_reliable, topic
-        assert (info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL) == latched, topic
-    seeing.ros.spin_until(lambda: node.get_subscriptions_info_by_topic("/joint_commands"), what="/joint_commands")
-    (commands,) = node.get_subscriptions_info_by_topic("/joint_commands")
-    assert commands.topic_type == "sensor_msgs/msg/JointState"
-    assert commands.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-    assert QOS_COMMAND.depth == 10
-    expected = {
-        f"/sim/{name}": [f"openarm_interfaces/srv/{kind}"]
-        for name, kind in (
-            ("reset_world", "ResetWorld"),
-            ("set_pause", "SetPause"),
-            ("step", "StepSimulation"),
-            ("spawn_object", "SpawnObject"),
-        )
-    }
-    seeing.ros.spin_until(
-        lambda: expected.items() <= dict(node.get_service_names_and_types()).items(), what="the services"
-    )
-    assert seeing.joints[0].name == [
-        f"openarm_{s}_{j}" for s in ("left", "right") for j in (*(f"joint{i}" for i in range(1, 8)), "finger_joint1")
-    ]
-    np.testing.assert_allclose(seeing.arm, seeing.HOME, atol=0.01)
+@pytest.fixture
+def steady(bridge) -> Bench:
+    """A bridge in real time, which publishes each tick."""
+    return bridge(images=False, speed=1.0)
 
 
 @pytest.mark.requirement("A-18", "A-19")
-def test_joint_states_are_a_tick_apart(bench) -> None:
+def test_joint_states_are_a_tick_apart(steady) -> None:
+    bench = steady
     states = bench.collect(JointState, "/joint_states", reliable(2000))  # a starved probe misses none
     clocks = bench.collect(Clock, "/clock", QOS_CLOCK)
-    bench.ros.spin_until(lambda: len(states) > 200 and clocks, what="two seconds of joint states")
+    bench.ros.spin_until(lambda: len(states) > 50 and clocks, what="half a second of joint states")
     assert set(np.diff([stamp_to_ns(m.header.stamp) for m in states])) == {10_000_000}
     assert all(stamp_to_ns(clock.clock) % 10_000_000 == 0 for clock in clocks)
 
@@ -102,7 +51,8 @@ def test_joint_states_are_a_tick_apart(bench) -> None:
 @pytest.mark.long
 @pytest.mark.alone
 @pytest.mark.requirement("A-18", "A-19")
-def test_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
+def test_hundred_hertz_in_step_with_the_wall_clock(steady) -> None:
+    bench = steady
     factors = bench.collect(Float64, "/sim/real_time_factor", 5)
     reports = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
     clocks = bench.collect(Clock, "/clock", QOS_CLOCK)
@@ -149,7 +99,8 @@ def test_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
 
 
 @pytest.mark.requirement("A-24")
-def test_the_imu_of_a_hand_publishes_gravity_at_rest_and_the_rate_of_a_turning_joint(bench) -> None:
+def test_the_imu_of_a_hand_publishes_gravity_at_rest_and_the_rate_of_a_turning_joint(steady) -> None:
+    bench = steady
     imus: list[Imu] = bench.collect(Imu, "/right_imu_sensor_broadcaster/imu", QOS_SENSOR)
     bench.ros.spin_until(lambda: imus, what="the IMU")
     at_rest = imus[-1]
@@ -159,7 +110,7 @@ def test_the_imu_of_a_hand_publishes_gravity_at_rest_and_the_rate_of_a_turning_j
     np.testing.assert_allclose(R @ xyz(at_rest.linear_acceleration), [0.0, 0.0, 9.81], atol=0.1)
     imus.clear()
     away = [*bench.HOME[:6], 1.0]
-    handle, future = bench.follow(bench.goal((1.0, away)))
+    handle, future = bench.follow(bench.goal((1.3, away)))
     assert handle.accepted
     bench.ros.result(future)
     joint, rates = bench.joints[-1].name.index("openarm_right_joint7"), {}
@@ -172,8 +123,9 @@ def test_the_imu_of_a_hand_publishes_gravity_at_rest_and_the_rate_of_a_turning_j
 
 
 @pytest.mark.requirement("A-04")
-def test_a_subscriber_that_asks_for_a_deadline_is_notified_of_a_gap(bench) -> None:
+def test_a_subscriber_that_asks_for_a_deadline_is_notified_of_a_gap(steady) -> None:
     """Lateness is noticed by the middleware; who asks for no deadline, or for best effort, hears all the same."""
+    bench = steady
     got: list[JointState] = []
     missed: list[int] = []
     events = SubscriptionEventCallbacks(deadline=lambda event: missed.append(event.total_count))
@@ -183,30 +135,20 @@ def test_a_subscriber_that_asks_for_a_deadline_is_notified_of_a_gap(bench) -> No
     node.create_subscription(JointState, "/joint_states", got.append, qos, event_callbacks=events)
     bench.ros.spin_until(lambda: len(got) > 20, what="joint states")
     before = len(missed)
-    bench.inject("joint_state_gap", "{ms: 500, every: 1.0}")
+    bench.inject("joint_state_gap", "{ms: 300, every: 0.4}")
     bench.ros.spin_until(lambda: len(missed) >= before + 2, what="missed deadlines")
     bench.clear()
     n = len(got)
     bench.ros.spin_until(lambda: len(got) > n + 50, what="joint states again")
 
 
-@pytest.mark.requirement("A-04")
-def test_a_sensor_can_not_be_had_reliably_and_that_is_reported(seeing) -> None:
-    refused: list[QoSPolicyKind] = []
-    events = SubscriptionEventCallbacks(incompatible_qos=lambda event: refused.append(event.last_policy_kind))
-    seeing.ros.node.create_subscription(
-        Image, "/overhead/color/image_raw", lambda _m: None, QOS_COMMAND, event_callbacks=events
-    )
-    seeing.ros.spin_until(lambda: refused, what="the refusal")
-    assert refused[0] == QoSPolicyKind.RELIABILITY
-
-
 @pytest.mark.requirement("A-73")
-def test_the_tree_of_frames_is_complete_and_has_no_gaps(bench) -> None:
+def test_the_tree_of_frames_is_complete_and_has_no_gaps(steady) -> None:
+    bench = steady
     static = bench.collect(TFMessage, "/tf_static", QOS_STATIC_TF)
     moving = bench.collect(TFMessage, "/tf", QOS_TF)
     bench.ros.spin_until(lambda: static, what="/tf_static")
-    bench.spin_sim(1.0)
+    bench.spin_sim(0.5)
     parents = {t.child_frame_id: t.header.frame_id for m in static + moving for t in m.transforms}
     description = RobotDescription.load()
     assert {j.child: j.parent for j in description.joints.values()}.items() <= parents.items()
@@ -220,7 +162,7 @@ def test_the_tree_of_frames_is_complete_and_has_no_gaps(bench) -> None:
     assert set(parents.values()) - set(parents) == {"world"}  # one root
     stamps = np.array([stamp_to_ns(m.transforms[0].header.stamp) for m in moving]) * 1e-9
     assert np.diff(stamps).max() <= 0.1
-    assert len(stamps) / (stamps[-1] - stamps[0]) == pytest.approx(50.0, rel=0.05)
+    assert (len(stamps) - 1) / (stamps[-1] - stamps[0]) == pytest.approx(50.0, rel=0.05)
     by_stamp = {stamp_to_ns(m.header.stamp): m for m in bench.joints}
     last = next(m for m in reversed(moving) if stamp_to_ns(m.transforms[0].header.stamp) in by_stamp)
     state = by_stamp[stamp_to_ns(last.transforms[0].header.stamp)]
@@ -236,7 +178,8 @@ def test_robot_description_is_latched(bench) -> None:
     assert got[0].data == RobotDescription.load().urdf
 
 
-def test_ground_truth_is_the_only_outlet_of_object_poses(bench) -> None:
+def test_ground_truth_is_the_only_outlet_of_object_poses(steady) -> None:
+    bench = steady
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", reliable(100))  # a starved probe misses none
     bench.ros.spin_until(lambda: len(got) > 10, what="ground truth")
     assert got[-1].header.frame_id == "world"
@@ -251,22 +194,21 @@ def test_ground_truth_is_the_only_outlet_of_object_poses(bench) -> None:
     ]
 
 
-def test_diagnostics_report_how_well_it_keeps_up(seeing) -> None:
-    got = seeing.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
-
-    def values() -> dict[str, str]:
-        return {v.key: v.value for m in got[-1:] for s in m.status for v in s.values}
-
-    expected = {
-        "real_time_factor",
-        "joint_state_period_p99_ms",
-        "joint_state_period_max_ms",
-        "frames_overhead",
-        "frames_wrist",
-    }
-    seeing.ros.spin_until(lambda: expected <= set(values()), what=f"a status with {', '.join(sorted(expected))}")
+@pytest.mark.requirement("A-47", "A-52")
+def test_depth_is_noisy_and_in_metres_by_parameter(bridge) -> None:
+    bench = bridge(depth_encoding="32FC1", depth_noise__enabled=True, scene="empty")
+    depth = bench.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
+    bench.ros.spin_until(lambda: depth, what="a depth image")
+    assert depth[-1].encoding == "32FC1"
+    z = image_to_array(depth[-1])
+    assert np.nanmedian(z) == pytest.approx(0.8, abs=0.2)
+    z = z[400:440, 300:340]
+    columns = z - np.nanmean(z, axis=1, keepdims=True)  # the table is level along a row
+    fx = load_cameras()["overhead"].intrinsics.fx
+    assert np.nanstd(columns) == pytest.approx(np.nanmean(z) ** 2 * 0.08 / (fx * 0.05), rel=0.2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.requirement("P-34")
 def test_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> None:

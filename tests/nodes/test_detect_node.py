@@ -25,6 +25,7 @@ from openarm_common.ros.convert import (
     stamp_to_ns,
 )
 from openarm_common.ros.node import QOS_LATCHED, QOS_SENSOR
+from openarm_perception.ros import detector_node
 from openarm_perception.ros.detector_node import DetectNode
 from tests.nodes.detect_bench import MS, TABLE, TOP, Bench, FakeCamera, Watch
 
@@ -98,7 +99,8 @@ def test_without_a_depth_topic_an_object_of_known_height_is_found_by_its_silhoue
 
 
 @pytest.mark.requirement("B-31")
-def test_a_camera_without_depth_is_named_with_what_to_do(ros) -> None:
+def test_a_camera_without_depth_is_named_with_what_to_do(ros, monkeypatch) -> None:
+    monkeypatch.setattr(detector_node, "_PATIENCE", 0.2)
     camera = FakeCamera(ros)
     bench = Bench(ros, camera=camera)
     ros.node.destroy_publisher(camera.pubs.pop("depth"))

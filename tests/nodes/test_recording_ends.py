@@ -12,30 +12,77 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
-from contextlib import ExitStack
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 
-from openarm_bringup.bags.bag import open_bag
+from openarm_bringup.bags import bag
+from openarm_bringup.bags.ros import recorder
+from openarm_bringup.commands import record
 from openarm_bringup.supervision.environment import PROFILE, write_profile
 from openarm_bringup.supervision.graph import NodeSpec
 from openarm_bringup.supervision.shm import SHM, names_of
+from openarm_common.errors import Code
 from openarm_common.ros.convert import array_to_image
 from openarm_common.ros.node import QOS_COMMAND
+from tests.conftest import DEADLINE_S
 from tests.nodes import streams
 
 TOPIC = "/overhead/color/image_raw"
+
+
+NOISE = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)  # does not get smaller
+
+
+def publish_until(images, ended: Callable[[], bool]) -> None:
+    for i in range(1000):
+        images.publish(array_to_image(NOISE, "rgb8", "optical", i))
+        images.wait_for_all_acked()
+        if ended():
+            return
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_a_recording_ends_when_it_is_stopped_or_the_disk_is_full(ros, tmp_path: Path, monkeypatch, full: bool) -> None:
+    stop, disk = threading.Event(), SimpleNamespace(free=10**12)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(recorder, "_KNOWN_S", 0.1)
+    monkeypatch.setattr(bag, "shutil", SimpleNamespace(disk_usage=lambda _: disk))
+    monkeypatch.setattr(record, "stop_event", lambda: nullcontext(stop))
+    images = ros.node.create_publisher(Image, TOPIC, QOS_COMMAND)
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(record.record, tmp_path / "bag", topics=(TOPIC,))
+        ros.spin_until(images.get_subscription_count, what="the recorder subscribes")
+        file = tmp_path / "bag" / "bag.mcap"
+        publish_until(images, lambda: file.stat().st_size > 4_000_000)
+        if full:
+            disk.free = 0
+            publish_until(images, done.done)
+        else:
+            stop.set()
+        answer = done.result(DEADLINE_S)
+    assert (answer.success, answer.code) == ((False, Code.ENVIRONMENT) if full else (True, Code.OK)), answer.message
+    assert ("recording ended early: the disk" in answer.message) == full
+    assert answer.data["topics"][TOPIC] >= 3
+    assert (answer.data["lost"] > 0) == full
+    with bag.open_bag(tmp_path / "bag") as opened:
+        assert (opened.mended is not None) == full
+        assert all(len(one.data) > NOISE.nbytes for one in opened.records())
 
 
 def small_files() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (5_000_000, 5_000_000))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("ending", "limit", "exit_code"),
     [
@@ -48,18 +95,13 @@ def test_what_was_recorded_can_be_read(
     ros, tmp_path: Path, ending: signal.Signals | None, limit: Callable[[], None] | None, exit_code: int
 ) -> None:
     images = ros.node.create_publisher(Image, TOPIC, QOS_COMMAND)
-    noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)  # does not get smaller
     command = [sys.executable, "-m", "openarm_bringup.cli", "record", "bag", "--topics", TOPIC, "--json"]
     env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     process = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True, preexec_fn=limit)
     try:
         ros.spin_until(images.get_subscription_count, what="the recorder subscribes")
         file = tmp_path / "bag" / "bag.mcap"
-        for i in range(1000):
-            images.publish(array_to_image(noise, "rgb8", "optical", i))
-            images.wait_for_all_acked()
-            if process.poll() is not None or (ending and file.stat().st_size > 4_000_000):
-                break
+        publish_until(images, lambda: process.poll() is not None or bool(ending and file.stat().st_size > 4_000_000))
         if ending:
             process.send_signal(ending)
         out, _ = process.communicate(timeout=60.0)
@@ -71,10 +113,10 @@ def test_what_was_recorded_can_be_read(
         answer = json.loads(out)
         assert answer["success"] == (exit_code == 0), answer["message"]
         assert ("File too large" in answer["message"]) == (ending is None)
-    with open_bag(tmp_path / "bag") as bag:
-        assert (bag.mended is None) == (ending == signal.SIGINT)
-        assert bag.counts[TOPIC] >= 3
-        assert all(len(record.data) > noise.nbytes for record in bag.records())
+    with bag.open_bag(tmp_path / "bag") as opened:
+        assert (opened.mended is None) == (ending == signal.SIGINT)
+        assert opened.counts[TOPIC] >= 3
+        assert all(len(one.data) > NOISE.nbytes for one in opened.records())
 
 
 HEAR = """
@@ -119,6 +161,7 @@ def killed_subscribers(ros) -> None:
         ros.spin_until(lambda: opened_again() == 2, 60.0, "the publisher has opened their ports again")
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("killed_subscribers")
 def test_what_comes_while_the_recorder_is_held_up_is_not_lost(tmp_path: Path) -> None:
     """As on a busy machine: a second of a graph, twice what Fast DDS keeps for a process by itself."""

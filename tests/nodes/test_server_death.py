@@ -130,6 +130,7 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(actions, "_SILENT_S", 60.0)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-21")
 def test_a_client_ends_when_its_server_is_stopped_or_killed_and_works_with_the_next(ros, children) -> None:
     with ThreadPoolExecutor() as pool, BackgroundNode("client") as client:
@@ -201,7 +202,10 @@ def test_the_probe_of_a_supervisor_knows_who_is_silent_and_when_it_is_deaf_itsel
 
 
 @pytest.mark.requirement("R-21")
-@pytest.mark.parametrize("undiscovered", [0, 3], ids=["discovered", "node_discovered_after_its_service"])
+@pytest.mark.parametrize(
+    "undiscovered",
+    [pytest.param(0, id="discovered"), pytest.param(3, id="node_discovered_after_its_service", marks=pytest.mark.long)],
+)
 def test_a_call_of_a_service_ends_when_its_node_is_killed(ros, children, undiscovered: int) -> None:
     with ThreadPoolExecutor() as pool, BackgroundNode("client", timeout=120.0) as client:
         nothing_yet, servers = iter(range(undiscovered)), client.servers
@@ -218,6 +222,7 @@ def test_a_call_of_a_service_ends_when_its_node_is_killed(ros, children, undisco
         assert not client._clients[NAME]._pending_requests, "what has no answer is no longer waited for"
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-21")
 def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> None:
     node = ros.add(BaseNode("grasp", Config))
@@ -265,6 +270,7 @@ def holds_after(bench, children) -> float:
     return (max(moving, default=killed_ns) - killed_ns) * 1e-9
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-21")
 def test_an_arm_holds_when_the_process_is_killed_that_sent_its_trajectory(bench, children) -> None:
     holds_after(bench, children)

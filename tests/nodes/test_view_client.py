@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import sys
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -299,9 +298,7 @@ def test_stop_and_cancel_are_answered_while_another_request_is_stuck(ros, patien
         ros.spin_until(stuck.is_set, what="a client that is stuck")
         reset = begin(lambda: view.reset(Reset(seed=3)))
         for question, answer in ((view.stop, (True, "heard")), (view.cancel, cancelled)):
-            began = time.monotonic()
             assert ask(ros, question) == answer
-            assert time.monotonic() - began < 2.0
         assert not reset, "the other client was not stuck"
     finally:
         go_on.set()

@@ -164,7 +164,7 @@ def test_a_bag_with_too_few_stands_says_so_and_shows_them(capsys, known, tmp_pat
         (["--board", "{kind: dots}"], 2, "boards: circles, symmetric_circles"),
         (["--board", "{rows: [}"], 2, "is not valid YAML"),
         (["--board", "dots"], 2, "expected keys and values"),
-        (["--board", "{rows: 9}"], 1, "too few poses"),
+        (["--board", "charuco"], 1, "too few poses"),
         (["--mount-seed", "-2"], 2, "expected 0 or more"),
         (["--session", "session.txt"], 2, "ends in .npz"),
         (["--algorithm", "tsay"], 2, "algorithms: REFINED"),

@@ -24,7 +24,7 @@ from tests.openarm_calibration.known_session import make_session
 @pytest.fixture(scope="module")
 def session_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("session") / "wrist.npz"
-    make_session("in_hand", 12).samples.save(path)
+    make_session("in_hand", 10).samples.save(path)
     return path
 
 
@@ -42,14 +42,10 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
 @pytest.mark.requirement("P-28")
 def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_path: Path) -> None:
     """From a session file to a stored calibration and a page, and back."""
-    code, out, _ = run(capsys, "solve", str(session_file))
-    assert code == 0
-    assert "predicted" in out
-    assert "DANIILIDIS" in out
     assert run(capsys, "list")[1].startswith("0 stored")
     code, out, _ = run(capsys, "save", str(session_file))
     assert code == 0
-    assert "Stored in" in out
+    assert all(part in out for part in ("predicted", "DANIILIDIS", "Stored in"))
     assert run(capsys, "save", str(session_file), "--algorithm", "park", "--force")[0] == 0
     code, out, _ = run(capsys, "list")
     assert "2 in its history" in out
@@ -66,7 +62,7 @@ def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_p
     figures = [b64decode(data) for data in re.findall(r"data:image/svg\+xml;base64,([^\"]+)", text)]
     assert [ElementTree.fromstring(figure).tag for figure in figures] == ["{http://www.w3.org/2000/svg}svg"] * 3
     assert text.count('class="gauge"') == 7
-    assert text.count('class="bar"') == 2 * 12
+    assert text.count('class="bar"') == 2 * 10
     assert "http" not in text.replace("http-equiv", "")
     code, out, _ = run(capsys, "check", str(session_file), "--json")
     data = json.loads(out)
@@ -88,7 +84,7 @@ def test_boards_are_written(capsys, tmp_path: Path, name: str, board: str) -> No
 
 def test_wrong_intrinsics_are_found_with_the_mount(capsys, tmp_path: Path) -> None:
     """A camera_info 3 % off fails by name; with free intrinsics the right ones and the true mount come out."""
-    known = make_session("in_hand", 15)
+    known = make_session("in_hand", 10)
     head = known.samples.head
     width, height, fx, fy, cx, cy = head.intrinsics
     known.samples.head = head.model_copy(update={"intrinsics": (width, height, 1.03 * fx, 1.03 * fy, cx, cy)})
@@ -177,7 +173,7 @@ def test_wrong_calls_say_what_is_wrong(
 
 @pytest.mark.requirement("A-41")
 def test_a_degenerate_session_is_exit_code_1_with_advice(capsys, session_file: Path) -> None:
-    names = [f"s{k:03d}" for k in range(3, 13)]
+    names = [f"s{k:03d}" for k in range(3, 11)]
     code, _, err = run(capsys, "solve", str(session_file), *[word for n in names for word in ("--exclude", n)])
     assert code == 1
     assert "DEGENERATE: too few poses: 2" in err

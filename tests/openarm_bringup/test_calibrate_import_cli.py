@@ -90,7 +90,7 @@ def info(path: Path, coefficients: np.ndarray | None = None) -> str:
     [
         ("in_hand", "wxyz", "mm", "T_base_tip", None),
         ("to_hand", "rpy_deg", "m", "T_tip_base", PLUMB_BOB),
-        ("in_hand", "rotvec", "m", "T_base_tip", RATIONAL),
+        pytest.param("in_hand", "rotvec", "m", "T_base_tip", RATIONAL, marks=pytest.mark.long),
     ],
 )
 @pytest.mark.requirement("P-28", "A-36", "A-42")
@@ -177,7 +177,7 @@ HAND = ("--camera-kind", "eye_in_hand")
         ),
         (("poses.csv", *HAND, *IMAGES[2:], "--images", "few"), 2, "has 0 images for 6 poses"),
         (("poses.csv", *HAND, *IMAGES[2:], "--images", "broken"), 1, "is no image that can be read"),
-        (("poses.csv", *HAND, *IMAGES[:2], *IMAGES[4:], "--board", "chessboard"), 1, "in 0 of 6 images"),
+        (("poses.csv", *HAND, *IMAGES[:2], *IMAGES[4:], "--board", "charuco"), 1, "in 0 of 6 images"),
         (("poses.csv", *HAND, *IMAGES, "--rotation", "matrix"), 1, "matrix with 7 numbers a pose"),
         (("poses.csv", *HAND, *IMAGES, "--image-topic", "/a"), 2, "--image-topic is no option of the format csv"),
         (("short.csv", *HAND, *IMAGES), 1, "5 numbers a pose"),

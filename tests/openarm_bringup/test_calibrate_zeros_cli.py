@@ -13,6 +13,7 @@ import pytest
 from openarm_bringup import cli
 from openarm_bringup.supervision.environment import client_environment
 from openarm_bringup.supervision.graph import load_graph
+from openarm_calibration.handeye import zero_sets
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.zeros import ZEROS, zeros_label
@@ -23,7 +24,7 @@ OFF = (0.0, 1.2, -0.8, 1.6, -1.1, 0.9, 0.0)
 
 
 def zeros_of_both() -> dict[str, float]:
-    robot = RobotDescription.from_folder("openarm_v1")
+    robot = RobotDescription.load()
     return {
         name: math.radians(off * sign)
         for arm, sign in (("right", 1.0), ("left", -1.0))
@@ -31,13 +32,12 @@ def zeros_of_both() -> dict[str, float]:
     }
 
 
-@pytest.fixture(scope="module")
-def sessions(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+def sessions(folder: Path, count: int) -> list[str]:
     """The camera over the table with a board in each hand, that on the right hand with one on the table."""
-    folder, out, zeros = tmp_path_factory.mktemp("sessions"), list[str](), zeros_of_both()
-    for name, setup, arm in (("o_right", "to_hand", "right"), ("o_left", "to_hand", "left"), ("w", "in_hand", "right")):
-        known = make_session(setup, 14, arm=arm, zeros=zeros, spread=0.5, seed=len(out))
-        path = folder / f"{name}.npz"
+    out, zeros = list[str](), zeros_of_both()
+    for setup, arm in (("to_hand", "right"), ("to_hand", "left"), ("in_hand", "right")):
+        known = make_session(setup, count, arm=arm, zeros=zeros, spread=0.5, seed=len(out))
+        path = folder / f"{setup}_{arm}.npz"
         known.samples.head = known.samples.head.model_copy(update={"mount_seed": None})
         known.samples.save(path)
         out.append(str(path))
@@ -56,17 +56,19 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict]:
     return code, json.loads(out)
 
 
+@pytest.mark.parametrize(("count", "folds"), [(8, 2), pytest.param(14, 5, marks=pytest.mark.long)])
 @pytest.mark.requirement("R-11")
 def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_back(
-    capsys, sessions: list[str], tmp_path: Path
+    capsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int, folds: int
 ) -> None:
-    page = tmp_path / "zeros.html"
-    code, answer = run(capsys, "zeros", *sessions, "--save", "--page", str(page))
+    monkeypatch.setattr(zero_sets, "_FOLDS", folds)
+    page, taken = tmp_path / "zeros.html", sessions(tmp_path, count)
+    code, answer = run(capsys, "zeros", *taken, "--save", "--page", str(page))
     assert code == 0, answer["message"]
     text = page.read_text()
-    assert text.count("the prior decides") == 4
-    assert all(name in text for name in (*zeros_of_both(), "overhead_1/s001", "wrist_3/s014"))
     data, truth = answer, zeros_of_both()
+    assert text.count("the prior decides") == 4
+    assert all(name in text for name in (*truth, "overhead_1/s001", f"wrist_3/s{count:03d}"))
     zeros = data["zeros"]
     assert set(zeros["by_prior"]) == {f"openarm_{arm}_joint{k}" for arm in ("right", "left") for k in (1, 7)}
     for name, value in zeros["offsets"].items():
@@ -76,12 +78,12 @@ def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_bac
     assert all(mount["zeros"] == zeros_label(zeros["offsets"]) for mount in data["mounts"].values())
 
     # a later solve of one session, at the stored zeros, passes; nothing but the command line says so
-    code, solved = run(capsys, "solve", sessions[2])
+    code, solved = run(capsys, "solve", taken[-1])
     assert solved["figures"]["robot_rotation"] < math.radians(0.02)
 
     # a graph of the real robot gives all its nodes the zeros; a simulated robot has its own, which nobody stored
     environment = client_environment(load_graph("real"), tmp_path / "run")
-    with pytest.MonkeyPatch.context() as patch:
+    with monkeypatch.context() as patch:
         patch.setenv(ZEROS, environment[ZEROS])
         robot = RobotDescription.load()
         q = dict.fromkeys(robot.joints, 0.3)
@@ -111,9 +113,12 @@ def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_bac
 
 
 @pytest.mark.requirement("R-11")
-def test_zeros_that_are_right_are_left_alone_and_nothing_is_stored(capsys, tmp_path: Path, store: Path) -> None:
+def test_zeros_that_are_right_are_left_alone_and_nothing_is_stored(
+    capsys, tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zero_sets, "_FOLDS", 2)
     path = tmp_path / "exact.npz"
-    make_session("to_hand", 14, spread=0.5).samples.save(path)
+    make_session("to_hand", 10, spread=0.5).samples.save(path)
     code, answer = run(capsys, "zeros", str(path), "--save")
     assert code == 1
     assert "nothing was stored" in answer["message"]
@@ -130,7 +135,8 @@ def test_zeros_that_are_right_are_left_alone_and_nothing_is_stored(capsys, tmp_p
         (["--sigma", "-1"], "--sigma and --prior"),
     ],
 )
-def test_wrong_priors_are_refused_with_what_is_valid(capsys, sessions: list[str], argv: list[str], part: str) -> None:
-    code, answer = run(capsys, "zeros", sessions[0], *argv)
+def test_wrong_priors_are_refused_with_what_is_valid(capsys, tmp_path: Path, argv: list[str], part: str) -> None:
+    make_session(count=3).samples.save(tmp_path / "three.npz")
+    code, answer = run(capsys, "zeros", str(tmp_path / "three.npz"), *argv)
     assert code != 0
     assert part in answer["message"]

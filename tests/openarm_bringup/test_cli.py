@@ -32,6 +32,13 @@ def own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
+def record(process: psutil.Process, graph: str, domain: int, nodes: dict[str, runs.NodeRecord], **more) -> Path:
+    """Write the record of a supervisor."""
+    about = {"pid": process.pid, "pid_created": process.create_time(), "discovery": "localhost"}
+    about |= {"run_dir": "", "started": f"2026-01-01T00:00:0{domain % 10}", "ready": True}
+    return runs.write_record(runs.RunRecord(graph=graph, domain=domain, nodes=nodes, **(about | more)))
+
+
 @pytest.mark.parametrize(
     ("argv", "path", "rest"),
     [
@@ -82,18 +89,18 @@ def test_refused_call_is_json_too(capsys: pytest.CaptureFixture[str]) -> None:
     assert answer["code"] == "INVALID_ARGUMENT"
 
 
-def test_failure_ends_with_1_and_its_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("nodes: {a: {module: x, needs: [b]}}", "CONFIG_INVALID"),
+        ("nodes: {a: {module: no_such_package.node}}", "there is no module no_such_package.node"),
+    ],
+)
+def test_failure_ends_with_1_and_its_code(tmp_path: Path, capsys, text: str, words: str) -> None:
     bad = tmp_path / "bad.yaml"
-    bad.write_text("nodes: {a: {module: x, needs: [b]}}")
+    bad.write_text(text)
     assert cli.run(["graph", "check", str(bad)]) == 1
-    assert "CONFIG_INVALID" in capsys.readouterr().err
-
-
-def test_missing_module_is_named_by_graph_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bad = tmp_path / "bad.yaml"
-    bad.write_text("nodes: {a: {module: no_such_package.node}}")
-    assert cli.run(["graph", "check", str(bad)]) == 1
-    assert "there is no module no_such_package.node" in capsys.readouterr().err
+    assert words in capsys.readouterr().err
 
 
 def test_graph_check_lists_what_it_runs_and_names_what_is_none_of_the_suite(
@@ -160,26 +167,13 @@ def test_up_warns_that_the_network_can_move_the_arms_before_it_starts_anything(
 
 
 def test_ps_and_logs_find_a_running_graph(capsys: pytest.CaptureFixture[str]) -> None:
-    import psutil
-
     assert cli.run(["ps", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["graphs"] == []
     me = psutil.Process()
     folder = runs.new_run_dir()
     (folder / "logs" / "arm.log").write_text("one\ntwo\nthree\n")
     node = runs.NodeRecord(state="ready", pid=me.pid, restarts=1, log=str(folder / "logs" / "arm.log"))
-    record = runs.RunRecord(
-        graph="toy",
-        pid=me.pid,
-        pid_created=me.create_time(),
-        domain=5,
-        discovery="localhost",
-        run_dir=str(folder),
-        started="2026-01-01T00:00:00",
-        ready=True,
-        nodes={"arm": node},
-    )
-    runs.write_record(record)
+    record(me, "toy", 5, {"arm": node}, run_dir=str(folder))
     assert cli.run(["ps", "--seconds", "0.05"]) == 0
     text = capsys.readouterr().out
     assert "toy: ready, robot openarm_v1, domain 5" in text
@@ -200,21 +194,12 @@ def test_several_graphs_are_distinguished_by_domain_and_one_that_lost_a_node_is_
     others = [subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(60)"]) for _ in range(2)]
     try:
         for process, domain, state in zip(others, (5, 7), ("failed", "ready"), strict=True):
-            runs.write_record(
-                runs.RunRecord(
-                    graph=f"part_{domain}",
-                    pid=process.pid,
-                    pid_created=psutil.Process(process.pid).create_time(),
-                    domain=domain,
-                    discovery="localhost",
-                    run_dir=str(tmp_path / str(domain)),
-                    started=f"2026-01-01T00:00:0{domain}",
-                    ready=state == "ready",
-                    nodes={f"eye_{domain}": runs.NodeRecord(state=state), "arm": runs.NodeRecord(state="ready")},
-                )
-            )
-            (tmp_path / str(domain) / "logs").mkdir(parents=True)
-            (tmp_path / str(domain) / "logs" / f"eye_{domain}.log").write_text(f"I am eye {domain}\n")
+            nodes = {f"eye_{domain}": runs.NodeRecord(state=state), "arm": runs.NodeRecord(state="ready")}
+            folder = tmp_path / str(domain)
+            supervisor = psutil.Process(process.pid)
+            record(supervisor, f"part_{domain}", domain, nodes, run_dir=str(folder), ready=state == "ready")
+            (folder / "logs").mkdir(parents=True)
+            (folder / "logs" / f"eye_{domain}.log").write_text(f"I am eye {domain}\n")
         assert cli.run(["ps", "--seconds", "0.05"]) == 0
         text = capsys.readouterr().out
         assert "part_5: degraded, without eye_5, robot openarm_v1, domain 5" in text
@@ -237,17 +222,7 @@ def test_several_graphs_are_distinguished_by_domain_and_one_that_lost_a_node_is_
 def test_a_graph_is_not_started_next_to_another_that_has_its_nodes(capsys: pytest.CaptureFixture[str]) -> None:
     other = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(60)"])
     ready = runs.NodeRecord(state="ready")
-    record = runs.RunRecord(
-        graph="arms",
-        pid=other.pid,
-        pid_created=psutil.Process(other.pid).create_time(),
-        domain=67,
-        discovery="localhost",
-        run_dir="",
-        started="",
-        nodes={"motion": ready, "eye": ready},
-    )
-    runs.write_record(record)
+    record(psutil.Process(other.pid), "arms", 67, {"motion": ready, "eye": ready})
     try:
         assert cli.run(["up", "motion", "--domain", "67", "--json"]) == 1
         answer = json.loads(capsys.readouterr().out)
@@ -261,10 +236,7 @@ def test_a_graph_is_not_started_next_to_another_that_has_its_nodes(capsys: pytes
 
 
 def test_record_of_another_process_with_the_same_number_is_not_alive() -> None:
-    record = runs.RunRecord(
-        graph="toy", pid=os.getpid(), pid_created=1.0, domain=0, discovery="localhost", run_dir="", started="", nodes={}
-    )
-    path = runs.write_record(record)
+    path = record(psutil.Process(), "toy", 0, {}, pid_created=1.0)
     assert runs.running() == []
     assert not path.exists()
 
@@ -298,12 +270,12 @@ def test_files_of_tests_that_wait_are_spread_among_those_that_compute() -> None:
     assert max(counts) - min(counts) <= 2
 
 
-def test_files_with_a_long_test_come_first_then_the_largest(tmp_path: Path) -> None:
+def test_the_largest_files_come_first(tmp_path: Path) -> None:
     tests = tmp_path / "tests"
     tests.mkdir()
-    for name, text in {"large": "#" * 90, "small": "", "long": "@pytest.mark." + "long"}.items():
+    for name, text in {"a_small": "", "large": "#" * 90}.items():
         (tests / f"test_{name}.py").write_text(text)
-    assert _in_order(tests) == ["tests/test_long.py", "tests/test_large.py", "tests/test_small.py"]
+    assert _in_order(tests) == ["tests/test_large.py", "tests/test_a_small.py"]
 
 
 def test_outcome_exit_codes() -> None:

@@ -21,6 +21,7 @@ from openarm_common.errors import Code, OpenArmError
 BAG = Path(__file__).parents[1] / "data" / "demo_pick"
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-32")
 def test_the_bag_of_the_repository_gives_its_golden_numbers_twice() -> None:
     """Perception and map in CI, from recorded topics, without GPU, display or graph."""
@@ -58,7 +59,8 @@ def test_the_bag_of_the_repository_shows_a_pick_from_start_to_end() -> None:
     assert all(distance < 1.0 for distance in moved.values())
 
 
-def test_a_changed_golden_number_fails_and_is_named(tmp_path: Path) -> None:
+@pytest.mark.requirement("P-32")
+def test_the_bag_gives_its_golden_numbers_and_a_changed_one_fails_and_is_named(tmp_path: Path) -> None:
     path = tmp_path / "golden.json"
     shutil.copy(BAG / "golden.json", path)
     data = json.loads(path.read_text())

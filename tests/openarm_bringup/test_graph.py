@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -94,36 +95,23 @@ def test_levels_follow_the_needs(tmp_path: Path) -> None:
     assert load_graph(write(tmp_path, BASE)).levels() == (("bridge",), ("arm",), ("hand",))
 
 
-def test_duplicate_node_is_refused_with_its_line(tmp_path: Path) -> None:
-    error = refused(tmp_path, BASE + "  arm: {module: other}\n")
-    assert error.code == Code.CONFIG_INVALID
-    assert "'arm' is given twice" in error.message
-    assert "line 16" in error.message
-
-
-def test_unknown_need_names_file_key_and_choices(tmp_path: Path) -> None:
-    error = refused(tmp_path, BASE.replace("needs: [bridge, arm]", "needs: [bridg]"))
-    assert "toy.yaml:nodes.hand.needs: unknown node 'bridg'; nodes are bridge, arm, hand" in error.message
-
-
-def test_circle_of_needs_is_spelled_out(tmp_path: Path) -> None:
-    error = refused(tmp_path, BASE.replace("    module: toy.bridge\n", "    module: toy.bridge\n    needs: [hand]\n"))
-    assert "bridge → hand → arm → bridge is a circle" in error.message
-
-
-def test_need_of_itself_is_a_circle(tmp_path: Path) -> None:
-    assert "arm → arm is a circle" in refused(tmp_path, BASE.replace("needs: [bridge]", "needs: [arm]")).message
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
+        ("  hand: {", "  arm: {module: other}\n  hand: {", r"'arm' is given twice.*line 15"),
+        (
+            "needs: [bridge, arm]",
+            "needs: [bridg]",
+            "toy.yaml:nodes.hand.needs: unknown node 'bridg'; nodes are bridge, arm, hand",
+        ),
+        ("module: toy.bridge", "module: toy.bridge\n    needs: [hand]", "bridge → hand → arm → bridge is a circle"),
+        ("needs: [bridge]", "needs: [arm]", "arm → arm is a circle"),
         ("{message: /joint_states}", "{message: /a, topic: /b}", "nodes.bridge.ready.0: give exactly one"),
         ("{message: /joint_states}", "{message: joint_states}", "must be an absolute name, such as /joint_states"),
         ("module: toy.arm", "modul: toy.arm", "nodes.arm.modul: unknown key"),
         ("seed: 3", "seed: -3", "seed: Input should be greater than or equal to 0, got -3"),
         ("scene: demo", "sene: demo", "sene: unknown key; valid keys: name, description, scene"),
-        ('"run ${seed}"', '"run ${sed}"', "params.label: unknown variable ${sed}; there are ${scene}, ${seed}"),
+        ('"run ${seed}"', '"run ${sed}"', r"params.label: unknown variable \${sed}; there are \${scene}, \${seed}"),
         ("module: toy.hand", "params_file: no.yaml, module: toy.hand", "nodes.hand.params_file: no.yaml is neither in"),
     ],
 )
@@ -131,7 +119,7 @@ def test_faults_name_the_key_and_what_is_valid(tmp_path: Path, old: str, new: st
     error = refused(tmp_path, BASE.replace(old, new))
     assert error.code == Code.CONFIG_INVALID
     assert "toy.yaml" in error.message
-    assert words in error.message
+    assert re.search(words, error.message, re.DOTALL), error.message
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import functools
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -14,13 +16,13 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from pathlib import Path
 
 import psutil
 import pytest
 
-from openarm_bringup.supervision import environment, keeper, runs
+from openarm_bringup.supervision import environment, guard, keeper, runs
 from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready, Restart
 from openarm_bringup.supervision.keeper import NodeState
 from openarm_bringup.supervision.process import Ladder
@@ -104,6 +106,16 @@ class Running:
         return [event.state for event in self.events if event.node == node]
 
 
+def in_loop(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Make a test of a coroutine."""
+
+    @functools.wraps(test)
+    def run(**given: object) -> None:
+        asyncio.run(test(**given))  # type: ignore[arg-type]
+
+    return run
+
+
 @contextlib.asynccontextmanager
 async def running(
     folder: Path, nodes: dict[str, NodeSpec], ladder: Ladder | None = None, probe: FileProbe | None = None
@@ -137,24 +149,22 @@ def wait_gone(pids: Sequence[int]) -> None:
 
 
 @pytest.mark.requirement("B-12")
-def test_nodes_start_when_their_needs_are_ready_and_stop_in_reverse(tmp_path: Path) -> None:
+@in_loop
+async def test_nodes_start_when_their_needs_are_ready_and_stop_in_reverse(tmp_path: Path) -> None:
     nodes = {
         "last": toy(tmp_path, "last", needs=("middle",)),
         "middle": toy(tmp_path, "middle", needs=("first",)),
         "first": toy(tmp_path, "first"),
     }
 
-    async def body() -> list[Event]:
-        async with running(tmp_path, nodes) as run:
-            await run.supervisor.wait_ready()
-            assert all(state == NodeState.READY for state in run.supervisor.states().values())
-            (record,) = runs.running()
-            assert record.ready
-            assert record.domain == 67
-        assert runs.running() == []
-        return run.events
-
-    events = [(event.node, event.state) for event in asyncio.run(body())]
+    async with running(tmp_path, nodes) as run:
+        await run.supervisor.wait_ready()
+        assert all(state == NodeState.READY for state in run.supervisor.states().values())
+        (record,) = runs.running()
+        assert record.ready
+        assert record.domain == 67
+    assert runs.running() == []
+    events = [(event.node, event.state) for event in run.events]
     starts = [node for node, state in events if state == NodeState.STARTING]
     stops = [node for node, state in events if state == NodeState.STOPPED]
     assert starts == ["first", "middle", "last"]
@@ -163,24 +173,23 @@ def test_nodes_start_when_their_needs_are_ready_and_stop_in_reverse(tmp_path: Pa
         assert events.index((need, NodeState.READY)) < events.index((node, NodeState.STARTING))
 
 
-def test_output_goes_to_a_log_per_node_with_the_time(tmp_path: Path) -> None:
+@in_loop
+async def test_output_goes_to_a_log_per_node_with_the_time(tmp_path: Path) -> None:
     body = (
         "print('to out', flush=True); print('to err', file=sys.stderr, flush=True);"
         "sys.stdout.write('no end'); sys.stdout.flush(); time.sleep(0.3)"
     )
 
-    async def run_it() -> None:
-        async with running(tmp_path, {"talker": toy(tmp_path, "talker", body)}) as run:
-            await run.until(lambda: NodeState.EXITED in run.seen("talker"))
-
-    asyncio.run(run_it())
+    async with running(tmp_path, {"talker": toy(tmp_path, "talker", body)}) as run:
+        await run.until(lambda: NodeState.EXITED in run.seen("talker"))
     lines = (tmp_path / "run" / "logs" / "talker.log").read_text().splitlines()
     assert [line.split(" ", 2)[2] for line in lines] == ["to out", "to err", "no end"]
     assert all(line[:2] == "20" and line[10] == " " for line in lines)
 
 
 @pytest.mark.requirement("P-34")
-def test_a_full_run_folder_holds_no_node_up_and_nothing_is_left_after_the_end(
+@in_loop
+async def test_a_full_run_folder_holds_no_node_up_and_nothing_is_left_after_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     logs = tmp_path / "run" / "logs"
@@ -193,47 +202,41 @@ def test_a_full_run_folder_holds_no_node_up_and_nothing_is_left_after_the_end(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    async def body() -> None:
-        async with running(tmp_path, nodes) as run:
-            await run.supervisor.wait_ready()
-            await run.until(lambda: (tmp_path / "talker.printed").exists())
-            monkeypatch.setattr(environment, "write_whole", full)
-            monkeypatch.setattr(runs, "write_record", full)
-            first = run.supervisor.pid("talker")
-            os.kill(first, signal.SIGKILL)
-            await run.until(lambda: run.seen("talker").count(NodeState.READY) == 2)
-            second = run.supervisor.pid("talker")
-        assert [gone(pid) for pid in (first, second)] == [True, True]
-        assert run.supervisor.lost_lines > 1
-        said = [event.detail for event in run.events if event.node == "supervisor"]
-        assert [text.partition(":")[0] for text in said] == [f"can't write to {f}" for f in (logs, runs.state_dir())]
-        assert runs.running() == []
-
-    asyncio.run(body())
+    async with running(tmp_path, nodes) as run:
+        await run.supervisor.wait_ready()
+        await run.until(lambda: (tmp_path / "talker.printed").exists())
+        monkeypatch.setattr(environment, "write_whole", full)
+        monkeypatch.setattr(runs, "write_record", full)
+        first = run.supervisor.pid("talker")
+        os.kill(first, signal.SIGKILL)
+        await run.until(lambda: run.seen("talker").count(NodeState.READY) == 2)
+        second = run.supervisor.pid("talker")
+    assert [gone(pid) for pid in (first, second)] == [True, True]
+    assert run.supervisor.lost_lines > 1
+    said = [event.detail for event in run.events if event.node == "supervisor"]
+    assert [text.partition(":")[0] for text in said] == [f"can't write to {f}" for f in (logs, runs.state_dir())]
+    assert runs.running() == []
 
 
-def test_failed_node_comes_back_and_old_endpoints_do_not_count_as_ready(tmp_path: Path) -> None:
+@in_loop
+async def test_failed_node_comes_back_and_old_endpoints_do_not_count_as_ready(tmp_path: Path) -> None:
     nodes = {"arm": toy(tmp_path, "arm", restart=Restart(backoff=0.05))}
-
-    async def body() -> None:
-        async with running(tmp_path, nodes) as run:
-            await run.supervisor.wait_ready()
-            first = run.supervisor.pid("arm")
-            os.kill(first, signal.SIGKILL)
-            await run.until(lambda: run.seen("arm").count(NodeState.READY) == 2)
-            second = run.supervisor.pid("arm")
-            assert second != first
-            assert (tmp_path / "arm").read_text() == str(second)
-        assert run.seen("arm") == [
-            NodeState.STARTING,
-            NodeState.READY,
-            NodeState.BACKOFF,
-            NodeState.STARTING,
-            NodeState.READY,
-            NodeState.STOPPED,
-        ]
-
-    asyncio.run(body())
+    async with running(tmp_path, nodes) as run:
+        await run.supervisor.wait_ready()
+        first = run.supervisor.pid("arm")
+        os.kill(first, signal.SIGKILL)
+        await run.until(lambda: run.seen("arm").count(NodeState.READY) == 2)
+        second = run.supervisor.pid("arm")
+        assert second != first
+        assert (tmp_path / "arm").read_text() == str(second)
+    assert run.seen("arm") == [
+        NodeState.STARTING,
+        NodeState.READY,
+        NodeState.BACKOFF,
+        NodeState.STARTING,
+        NodeState.READY,
+        NodeState.STOPPED,
+    ]
 
 
 def test_a_successor_does_not_get_the_ports_of_the_one_that_was_killed(tmp_path: Path) -> None:
@@ -265,119 +268,99 @@ time.sleep(60)
     asyncio.run(body())
 
 
-def test_a_node_that_hangs_is_started_again_and_one_that_somebody_has_halted_is_left_alone(
+@in_loop
+async def test_a_node_that_hangs_is_started_again_and_one_that_somebody_has_halted_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(keeper, "_HANGS_S", 0.1)
     monkeypatch.setattr(keeper, "_LOOK_S", 0.01)
     probe = FileProbe(tmp_path)
+    async with running(tmp_path, {"toy": toy(tmp_path, "toy")}, probe=probe) as run:
+        await run.supervisor.wait_ready()
+        pid = run.supervisor.pid("toy")
+        os.kill(pid, signal.SIGSTOP)
+        probe.silent_s, asked = 20.0, probe.asked
+        await run.until(lambda: probe.asked > asked + 50)
+        assert run.seen("toy")[-1] is NodeState.READY
+        assert run.supervisor.pid("toy") == pid
 
-    async def body() -> None:
-        async with running(tmp_path, {"toy": toy(tmp_path, "toy")}, probe=probe) as run:
-            await run.supervisor.wait_ready()
-            pid = run.supervisor.pid("toy")
-            os.kill(pid, signal.SIGSTOP)
-            probe.silent_s, asked = 20.0, probe.asked
-            await run.until(lambda: probe.asked > asked + 50)
-            assert run.seen("toy")[-1] is NodeState.READY
-            assert run.supervisor.pid("toy") == pid
-
-            os.kill(pid, signal.SIGCONT)
-            await run.until(lambda: NodeState.BACKOFF in run.seen("toy"))
-            probe.silent_s = 0.0
-            assert run.events[-1].detail.startswith("hung: no sign of life for 20 s; restart 1 of 5")
-            await run.until(lambda: run.supervisor.states()["toy"] is NodeState.READY)
-            assert gone(pid)
-
-    asyncio.run(body())
+        os.kill(pid, signal.SIGCONT)
+        await run.until(lambda: NodeState.BACKOFF in run.seen("toy"))
+        probe.silent_s = 0.0
+        assert run.events[-1].detail.startswith("hung: no sign of life for 20 s; restart 1 of 5")
+        await run.until(lambda: run.supervisor.states()["toy"] is NodeState.READY)
+        assert gone(pid)
 
 
-def test_restarts_end_after_the_maximum_with_the_log_in_the_message(tmp_path: Path) -> None:
+@in_loop
+async def test_restarts_end_after_the_maximum_with_the_log_in_the_message(tmp_path: Path) -> None:
     crash = "time.sleep(0.2); print('no camera found', flush=True); sys.exit(3)"
     nodes = {"eye": toy(tmp_path, "eye", crash, restart=Restart(backoff=0.05, max=2))}
 
-    async def body() -> OpenArmError:
-        async with running(tmp_path, nodes) as run:
-            with pytest.raises(OpenArmError) as caught:
-                await run.supervisor.wait_stop_asked()
-            assert run.seen("eye").count(NodeState.BACKOFF) == 2
-            assert run.seen("eye")[-1] == NodeState.FAILED
-            return caught.value
-
-    error = asyncio.run(body())
-    assert error.code == Code.NOT_READY
-    assert "ended with code 3 after 2 restarts" in error.message
-    assert "no camera found" in error.message
+    async with running(tmp_path, nodes) as run:
+        with pytest.raises(OpenArmError, match=r"(?s)ended with code 3 after 2 restarts.*no camera found") as caught:
+            await run.supervisor.wait_stop_asked()
+        assert run.seen("eye").count(NodeState.BACKOFF) == 2
+        assert run.seen("eye")[-1] == NodeState.FAILED
+    assert caught.value.code == Code.NOT_READY
 
 
-def test_node_that_never_gets_ready_is_named_with_what_is_missing(tmp_path: Path) -> None:
-    silent = NodeSpec(
-        command=("python", "-S", "-c", "import time; time.sleep(60)"), ready=(Ready(action="/pick"),), ready_timeout=0.5
-    )
-
-    async def body() -> OpenArmError:
-        async with running(tmp_path, {"silent": silent}) as run:
-            with pytest.raises(OpenArmError) as caught:
-                await run.supervisor.wait_ready()
-            return caught.value
-
-    assert "silent was not ready after 0.5 s; missing: action /pick" in asyncio.run(body()).message
+SLEEP = ("python", "-S", "-c", "import time; time.sleep(60)")
+BROKEN = ("python", "-c", "raise SystemExit('no such scene')")
 
 
-def test_node_that_fails_at_its_first_start_fails_the_graph_at_once(tmp_path: Path) -> None:
-    broken = NodeSpec(command=("python", "-c", "raise SystemExit('no such scene')"), ready=(Ready(service="/x"),))
+@pytest.mark.parametrize(
+    ("node", "words"),
+    [
+        (
+            {"command": SLEEP, "ready": (Ready(action="/pick"),), "ready_timeout": 0.5},
+            "arm was not ready after 0.5 s; missing: action /pick",
+        ),
+        ({"command": BROKEN, "ready": (Ready(service="/x"),)}, "no such scene"),
+        ({"params": {"sped": 1}}, "no parameter of arm 'sped'; did you mean speed?"),
+    ],
+    ids=["never ready", "fails at its first start", "unknown parameter, which ROS would ignore"],
+)
+@in_loop
+async def test_a_node_that_does_not_come_up_fails_the_graph(
+    tmp_path: Path, node: dict[str, object], words: str
+) -> None:
+    nodes = {"arm": toy(tmp_path, "arm").model_copy(update=node)}
+    async with running(tmp_path, nodes) as run:
+        with pytest.raises(OpenArmError, match=re.escape(words)):
+            await run.supervisor.wait_ready()
 
-    async def body() -> OpenArmError:
-        async with running(tmp_path, {"broken": broken}) as run:
-            with pytest.raises(OpenArmError) as caught:
-                await run.supervisor.wait_ready()
-            return caught.value
 
-    assert "no such scene" in asyncio.run(body()).message
+@in_loop
+async def test_error_inside_the_probe_is_raised_and_not_waited_for_ever(tmp_path: Path) -> None:
+    def no_rclpy() -> FileProbe:
+        raise ImportError("no rclpy here")
 
-
-def test_unknown_parameter_is_refused_because_ros_would_ignore_it(tmp_path: Path) -> None:
-    async def body() -> OpenArmError:
-        async with running(tmp_path, {"arm": toy(tmp_path, "arm", params={"sped": 1})}) as run:
-            with pytest.raises(OpenArmError) as caught:
-                await run.supervisor.wait_ready()
-            return caught.value
-
-    assert "no parameter of arm 'sped'; did you mean speed?" in asyncio.run(body()).message
-
-
-def test_error_inside_the_probe_is_raised_and_not_waited_for_ever(tmp_path: Path) -> None:
-    async def body() -> None:
-        def no_rclpy() -> FileProbe:
-            raise ImportError("no rclpy here")
-
-        supervisor = Supervisor(Graph(name="toy", nodes={"arm": toy(tmp_path, "arm")}), tmp_path / "run", no_rclpy)
-        await supervisor.start()
-        try:
-            with pytest.raises(ImportError, match="no rclpy here"):
-                await supervisor.wait_ready()
-        finally:
-            await supervisor.stop()
-
-    asyncio.run(body())
+    supervisor = Supervisor(Graph(name="toy", nodes={"arm": toy(tmp_path, "arm")}), tmp_path / "run", no_rclpy)
+    await supervisor.start()
+    try:
+        with pytest.raises(ImportError, match="no rclpy here"):
+            await supervisor.wait_ready()
+    finally:
+        await supervisor.stop()
 
 
 @pytest.mark.requirement("P-34")
-def test_grandchildren_end_with_their_node(tmp_path: Path) -> None:
+@in_loop
+async def test_grandchildren_end_with_their_node(tmp_path: Path) -> None:
     body = (
-        "import subprocess; c = subprocess.Popen([sys.executable, '-S', '-c', "
-        "'import signal, time; signal.signal(2, signal.SIG_IGN); signal.signal(15, signal.SIG_IGN); time.sleep(60)']);"
-        "pathlib.Path(sys.argv[1] + '.child').write_text(str(c.pid)); time.sleep(60)"
+        "import subprocess; subprocess.Popen([sys.executable, '-S', '-c', 'import os, pathlib, signal, sys, time;"
+        " signal.signal(2, signal.SIG_IGN); signal.signal(15, signal.SIG_IGN);"
+        " pathlib.Path(sys.argv[1]).write_text(str(os.getpid())); time.sleep(60)', sys.argv[1] + '.child']);"
+        " time.sleep(60)"
     )
 
-    async def run_it() -> list[int]:
-        async with running(tmp_path, {"parent": toy(tmp_path, "parent", body)}) as run:
-            await run.supervisor.wait_ready()
-            child = tmp_path / "parent.child"
-            await run.until(lambda: child.exists() and child.read_text() != "")
-            return [run.supervisor.pid("parent"), int((tmp_path / "parent.child").read_text())]
-
-    wait_gone(asyncio.run(run_it()))
+    async with running(tmp_path, {"parent": toy(tmp_path, "parent", body)}, Ladder(0.1, 0.1)) as run:
+        await run.supervisor.wait_ready()
+        child = tmp_path / "parent.child"
+        await run.until(lambda: child.exists() and child.read_text() != "")
+        pids = [run.supervisor.pid("parent"), int(child.read_text())]
+    wait_gone(pids)
 
 
 DEAF_TO_INT = "import signal; signal.signal(2, signal.SIG_IGN); print('deaf', flush=True); time.sleep(60)"
@@ -392,62 +375,66 @@ STUBBORN = "import signal; signal.signal(15, signal.SIG_IGN);" + DEAF_TO_INT
         (STUBBORN, Ladder(0.1, 0.1), "killed (-9)"),
     ],
 )
-def test_stop_goes_up_the_ladder_int_term_kill(tmp_path: Path, body: str, ladder: Ladder, detail: str) -> None:
-    async def run_it() -> str:
-        async with running(tmp_path, {"toy": toy(tmp_path, "toy", body)}, ladder) as run:
-            await run.supervisor.wait_ready()
-            if body != "time.sleep(60)":
-                log = tmp_path / "run" / "logs" / "toy.log"
-                await run.until(lambda: log.exists() and "deaf" in log.read_text())
-        return run.events[-1].detail
-
-    assert asyncio.run(run_it()).startswith(detail)
+@in_loop
+async def test_stop_goes_up_the_ladder_int_term_kill(tmp_path: Path, body: str, ladder: Ladder, detail: str) -> None:
+    async with running(tmp_path, {"toy": toy(tmp_path, "toy", body)}, ladder) as run:
+        await run.supervisor.wait_ready()
+        if body != "time.sleep(60)":
+            log = tmp_path / "run" / "logs" / "toy.log"
+            await run.until(lambda: log.exists() and "deaf" in log.read_text())
+    assert run.events[-1].detail.startswith(detail)
 
 
-def test_the_probe_leaves_while_the_nodes_are_still_there(tmp_path: Path) -> None:
+@in_loop
+async def test_the_probe_leaves_while_the_nodes_are_still_there(tmp_path: Path) -> None:
     """Fast DDS may hold a participant for ever whose peers have just gone."""
+    closed: list[tuple[str, bool]] = []
 
-    async def run_it() -> list[tuple[str, bool]]:
-        closed: list[tuple[str, bool]] = []
+    class Leaving(FileProbe):
+        def close(self) -> None:
+            closed.extend((name, not gone(run.supervisor.pid(name))) for name in run.supervisor.states())
 
-        class Leaving(FileProbe):
-            def close(self) -> None:
-                closed.extend((name, not gone(run.supervisor.pid(name))) for name in run.supervisor.states())
-
-        run = Running(tmp_path, {name: toy(tmp_path, name) for name in "ab"}, probe=Leaving(tmp_path))
-        await run.supervisor.start()
+    async with running(tmp_path, {name: toy(tmp_path, name) for name in "ab"}, probe=Leaving(tmp_path)) as run:
         await run.supervisor.wait_ready()
-        await run.supervisor.stop()
-        return closed
-
-    assert asyncio.run(run_it()) == [("a", True), ("b", True)]
+    assert closed == [("a", True), ("b", True)]
 
 
-def test_second_ctrl_c_is_the_emergency_stop_and_cuts_the_patience_short(tmp_path: Path) -> None:
-    async def run_it() -> None:
-        run = Running(tmp_path, {"deaf": toy(tmp_path, "deaf", STUBBORN)}, Ladder(600.0, 600.0))
-        await run.supervisor.start()
-        await run.supervisor.wait_ready()
-        log = tmp_path / "run" / "logs" / "deaf.log"
-        await run.until(lambda: log.exists() and "deaf" in log.read_text())
-        run.supervisor.ask_stop()
-        stopping = asyncio.create_task(run.supervisor.stop())
-        await asyncio.sleep(0.3)
-        assert not (tmp_path / "held").exists(), "the first only ends the graph"
-        run.supervisor.ask_stop()
-        await run.until((tmp_path / "held").exists)  # the second is the emergency stop
-        async with asyncio.timeout(DEADLINE_S):
-            while not stopping.done():
-                run.supervisor.ask_stop()
-                await asyncio.sleep(0.1)
-        await stopping
-
-    asyncio.run(run_it())
+@in_loop
+async def test_second_ctrl_c_is_the_emergency_stop_and_cuts_the_patience_short(tmp_path: Path) -> None:
+    run = Running(tmp_path, {"deaf": toy(tmp_path, "deaf", STUBBORN)}, Ladder(600.0, 600.0))
+    await run.supervisor.start()
+    await run.supervisor.wait_ready()
+    log = tmp_path / "run" / "logs" / "deaf.log"
+    await run.until(lambda: log.exists() and "deaf" in log.read_text())
+    run.supervisor.ask_stop()
+    stopping = asyncio.create_task(run.supervisor.stop())
+    await asyncio.sleep(0.3)
+    assert not (tmp_path / "held").exists(), "the first only ends the graph"
+    run.supervisor.ask_stop()
+    await run.until((tmp_path / "held").exists)  # the second is the emergency stop
+    async with asyncio.timeout(DEADLINE_S):
+        while not stopping.done():
+            run.supervisor.ask_stop()
+            await asyncio.sleep(0.1)
+    await stopping
 
 
+def test_the_guard_goes_up_its_ladder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard, "LADDER", ((signal.SIGINT, 0.1), (signal.SIGTERM, 0.1), (signal.SIGKILL, DEADLINE_S)))
+    node = subprocess.Popen(
+        [sys.executable, "-S", "-c", f"import time; {STUBBORN}"], stdout=subprocess.PIPE, start_new_session=True
+    )
+    assert node.stdout is not None
+    assert node.stdout.readline() == b"deaf\n"
+    guard.end({node.pid})
+    node.communicate()
+    assert node.returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("body", ["time.sleep(60)", pytest.param(DEAF_TO_INT, marks=pytest.mark.long)])
 @pytest.mark.requirement("P-34")
-def test_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
-    """SIGKILL leaves the supervisor no time for anything: its guard ends the nodes, deaf ones and grandchildren too."""
+def test_children_end_when_the_supervisor_is_killed(tmp_path: Path, body: str) -> None:
+    """SIGKILL leaves the supervisor no time for anything: its guard ends the nodes."""
     script = tmp_path / "supervise.py"
     script.write_text(
         textwrap.dedent(
@@ -458,7 +445,7 @@ def test_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
             import test_supervisor as t
             folder = Path({str(tmp_path)!r})
             async def main():
-                nodes = {{"meek": t.toy(folder, "meek"), "deaf": t.toy(folder, "deaf", t.DEAF_TO_INT)}}
+                nodes = {{name: t.toy(folder, name, {body!r}) for name in "ab"}}
                 run = t.Running(folder, nodes)
                 await run.supervisor.start()
                 await run.supervisor.wait_ready()

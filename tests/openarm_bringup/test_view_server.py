@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import hashlib
+import inspect
 import json
 import re
 import threading
@@ -102,12 +104,21 @@ async def serving(host: str = "127.0.0.1") -> AsyncIterator[Bench]:
             graph.go_on.set()
 
 
-def with_bench(test: Callable[[Bench], Awaitable[None]]) -> None:
-    async def main() -> None:
-        async with serving() as bench:
-            await asyncio.wait_for(test(bench), 120.0)
+def with_bench(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Make a test of a coroutine whose first argument is a bench."""
 
-    asyncio.run(main())
+    def run(**given: Any) -> None:
+        async def main() -> None:
+            async with serving() as bench:
+                await asyncio.wait_for(test(bench, **given), 120.0)
+
+        asyncio.run(main())
+
+    signature = inspect.signature(test)
+    functools.update_wrapper(run, test)
+    del run.__wrapped__  # whose first argument is no fixture
+    run.__signature__ = signature.replace(parameters=list(signature.parameters.values())[1:])  # type: ignore[attr-defined]
+    return run
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -133,52 +144,43 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_who_may_not_gets_403_and_nothing_is_asked_of_the_robot(wrong: str) -> None:
+@with_bench
+async def test_who_may_not_gets_403_and_nothing_is_asked_of_the_robot(bench: Bench, wrong: str) -> None:
     headers, why = WRONG[wrong]
-
-    async def test(bench: Bench) -> None:
-        for path, body in (("/pick", {"label": "red"}), ("/cancel", {}), ("/reset", {})):
-            status, answer = await bench.post(path, body, **headers)
-            assert (status, answer["success"]) == (403, False)
-            assert why in answer["message"]
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-            async with bench.socket(**headers):
-                pass
-        assert refused.value.status == 403
-        assert bench.graph.asked == []
-        assert bench.graph.wanted == frozenset()
-
-    with_bench(test)
+    for path, body in (("/pick", {"label": "red"}), ("/cancel", {}), ("/reset", {})):
+        status, answer = await bench.post(path, body, **headers)
+        assert (status, answer["success"]) == (403, False)
+        assert why in answer["message"]
+    with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+        async with bench.socket(**headers):
+            pass
+    assert refused.value.status == 403
+    assert bench.graph.asked == []
+    assert bench.graph.wanted == frozenset()
 
 
-def test_the_page_itself_has_one_of_our_names_and_shows_nothing_without_the_token() -> None:
+@with_bench
+async def test_the_page_itself_has_one_of_our_names_and_shows_nothing_without_the_token(bench: Bench) -> None:
     """The token comes after the # of the address, which no server gets."""
-
-    async def test(bench: Bench) -> None:
-        for name in ("localhost:8088", "[::1]:8088"):
-            status, text = await bench.get("/", Host=name)
-            assert (status, bench.token in text) == (200, False)
-        for name in ("evil.example", "192.168.1.2:8088", "127.0.0.1.evil.example", "[::1", "@127.0.0.1"):
-            status, text = await bench.get("/", Host=name)
-            assert status == 403, name
-            assert "answers to" in text
-        for path in ("/socket", f"/socket?token={bench.token[:-1]}", f"/socket?other={bench.token}"):
-            assert (await bench.get(path, **bench.origin))[0] == 403
-        async with bench.session.post(f"{bench.url}/stop?token={bench.token}", headers=bench.origin) as response:
-            assert response.status == 403  # an address that is kept somewhere moves nothing
-
-    with_bench(test)
+    for name in ("localhost:8088", "[::1]:8088"):
+        status, text = await bench.get("/", Host=name)
+        assert (status, bench.token in text) == (200, False)
+    for name in ("evil.example", "192.168.1.2:8088", "127.0.0.1.evil.example", "[::1", "@127.0.0.1"):
+        status, text = await bench.get("/", Host=name)
+        assert status == 403, name
+        assert "answers to" in text
+    for path in ("/socket", f"/socket?token={bench.token[:-1]}", f"/socket?other={bench.token}"):
+        assert (await bench.get(path, **bench.origin))[0] == 403
+    async with bench.session.post(f"{bench.url}/stop?token={bench.token}", headers=bench.origin) as response:
+        assert response.status == 403  # an address that is kept somewhere moves nothing
 
 
-def test_only_json_can_ask() -> None:
+@with_bench
+async def test_only_json_can_ask(bench: Bench) -> None:
     """A form of another page can't send that type without asking first."""
-
-    async def test(bench: Bench) -> None:
-        status, _ = await bench.post("/pick", {"label": "red"}, **{"Content-Type": "text/plain"})
-        assert status == 415
-        assert bench.graph.asked == []
-
-    with_bench(test)
+    status, _ = await bench.post("/pick", {"label": "red"}, **{"Content-Type": "text/plain"})
+    assert status == 415
+    assert bench.graph.asked == []
 
 
 def test_beyond_this_machine_addresses_are_known_by_number_and_by_the_name_given() -> None:
@@ -204,17 +206,15 @@ def test_a_token_is_new_each_time_and_never_short() -> None:
         Guard(token="secret")
 
 
-def test_every_answer_forbids_scripts_of_others() -> None:
-    async def test(bench: Bench) -> None:
-        for path in ("/", "/view.js", "/nothing", "/socket"):
-            async with bench.session.get(bench.url + path) as response:
-                policy = response.headers["Content-Security-Policy"]
-                assert "default-src 'none'" in policy
-                assert "script-src 'self'" in policy
-                assert "unsafe" not in policy
-                assert response.headers["X-Content-Type-Options"] == "nosniff"
-
-    with_bench(test)
+@with_bench
+async def test_every_answer_forbids_scripts_of_others(bench: Bench) -> None:
+    for path in ("/", "/view.js", "/nothing", "/socket"):
+        async with bench.session.get(bench.url + path) as response:
+            policy = response.headers["Content-Security-Policy"]
+            assert "default-src 'none'" in policy
+            assert "script-src 'self'" in policy
+            assert "unsafe" not in policy
+            assert response.headers["X-Content-Type-Options"] == "nosniff"
 
 
 def test_labels_can_only_become_text() -> None:
@@ -237,65 +237,57 @@ def test_vendored_files_are_those_that_are_named() -> None:
 
 
 # --- what is shown
-def test_a_page_gets_what_it_wants_and_the_graph_is_looked_at_only_while_it_does() -> None:
-    async def test(bench: Bench) -> None:
-        async with bench.socket() as socket:
-            assert (await socket.receive_json())["kind"] == "hello"
-            await until(lambda: bench.graph.wanted == {"states"})
-            await socket.send_json({"want": ["robot"]})
-            await until(lambda: bench.graph.wanted == {"states", "robot"})
-            bench.server.put(Item("image:overhead", "image:overhead", b"not wanted"))
-            bench.server.put(Item("robot", "robot", b"wanted"))
-            assert await socket.receive_bytes() == b"wanted"
-            await socket.send_json({"want": []})
-            await until(lambda: bench.graph.wanted == {"states"})
-        await until(lambda: bench.graph.wanted == frozenset())
-
-    with_bench(test)
+@with_bench
+async def test_a_page_gets_what_it_wants_and_the_graph_is_looked_at_only_while_it_does(bench: Bench) -> None:
+    async with bench.socket() as socket:
+        assert (await socket.receive_json())["kind"] == "hello"
+        await until(lambda: bench.graph.wanted == {"states"})
+        await socket.send_json({"want": ["robot"]})
+        await until(lambda: bench.graph.wanted == {"states", "robot"})
+        bench.server.put(Item("image:overhead", "image:overhead", b"not wanted"))
+        bench.server.put(Item("robot", "robot", b"wanted"))
+        assert await socket.receive_bytes() == b"wanted"
+        await socket.send_json({"want": []})
+        await until(lambda: bench.graph.wanted == {"states"})
+    await until(lambda: bench.graph.wanted == frozenset())
 
 
-def test_a_page_that_comes_later_gets_the_newest_of_each() -> None:
-    async def test(bench: Bench) -> None:
-        for text in ("old", "new"):
-            bench.server.put(Item("states", "grasp", text))
-        async with bench.socket() as socket:
-            await socket.receive_json()
-            assert await socket.receive_str() == "new"
-
-    with_bench(test)
+@with_bench
+async def test_a_page_that_comes_later_gets_the_newest_of_each(bench: Bench) -> None:
+    for text in ("old", "new"):
+        bench.server.put(Item("states", "grasp", text))
+    async with bench.socket() as socket:
+        await socket.receive_json()
+        assert await socket.receive_str() == "new"
 
 
 @pytest.mark.parametrize("message", ['{"want": ["everything"]}', '{"want": 3}', "}{"])
-def test_a_page_that_sends_nonsense_is_answered_and_closed(message: str) -> None:
-    async def test(bench: Bench) -> None:
-        async with bench.socket() as socket:
-            await socket.receive_json()
-            await socket.send_str(message)
-            closing = await socket.receive()
-            assert closing.type is aiohttp.WSMsgType.CLOSE
-            assert closing.data == aiohttp.WSCloseCode.POLICY_VIOLATION
-            assert closing.extra
-
-    with_bench(test)
+@with_bench
+async def test_a_page_that_sends_nonsense_is_answered_and_closed(bench: Bench, message: str) -> None:
+    async with bench.socket() as socket:
+        await socket.receive_json()
+        await socket.send_str(message)
+        closing = await socket.receive()
+        assert closing.type is aiohttp.WSMsgType.CLOSE
+        assert closing.data == aiohttp.WSCloseCode.POLICY_VIOLATION
+        assert closing.extra
 
 
 # --- what is asked
-def test_a_pick_is_asked_once_at_a_time_and_its_outcome_is_shown() -> None:
-    async def test(bench: Bench) -> None:
-        status, answer = await bench.post("/pick", {"label": "red", "arm": "left", "dry_run": True})
-        assert (status, answer["success"]) == (202, True)
-        await until(lambda: bench.graph.asked)
-        assert bench.graph.asked == [Order(label="red", arm="left", dry_run=True)]
-        status, answer = await bench.post("/pick", {"label": "blue"})
-        assert (status, answer["code"]) == (409, "BUSY")
-        bench.graph.go_on.set()
-        async with bench.socket() as socket:
-            async with asyncio.timeout(DEADLINE_S):
-                while (message := await socket.receive_json()).get("running", True):
-                    pass
-            assert message == {"kind": "outcome", "running": False, "success": True, "code": "OK", "message": "placed"}
-
-    with_bench(test)
+@with_bench
+async def test_a_pick_is_asked_once_at_a_time_and_its_outcome_is_shown(bench: Bench) -> None:
+    status, answer = await bench.post("/pick", {"label": "red", "arm": "left", "dry_run": True})
+    assert (status, answer["success"]) == (202, True)
+    await until(lambda: bench.graph.asked)
+    assert bench.graph.asked == [Order(label="red", arm="left", dry_run=True)]
+    status, answer = await bench.post("/pick", {"label": "blue"})
+    assert (status, answer["code"]) == (409, "BUSY")
+    bench.graph.go_on.set()
+    async with bench.socket() as socket:
+        async with asyncio.timeout(DEADLINE_S):
+            while (message := await socket.receive_json()).get("running", True):
+                pass
+        assert message == {"kind": "outcome", "running": False, "success": True, "code": "OK", "message": "placed"}
 
 
 @pytest.mark.parametrize(
@@ -311,58 +303,52 @@ def test_a_pick_is_asked_once_at_a_time_and_its_outcome_is_shown() -> None:
         ("/reset", {"seed": -1}, "seed"),
     ],
 )
-def test_a_wrong_request_is_refused_by_the_name_of_what_is_wrong(path: str, body: dict[str, Any], why: str) -> None:
-    async def test(bench: Bench) -> None:
-        status, answer = await bench.post(path, body)
-        assert (status, answer["code"]) == (400, "INVALID_ARGUMENT")
-        assert f"{path}:{why}" in answer["message"]
-        assert bench.graph.asked == []
-
-    with_bench(test)
+@with_bench
+async def test_a_wrong_request_is_refused_by_the_name_of_what_is_wrong(
+    bench: Bench, path: str, body: dict[str, Any], why: str
+) -> None:
+    status, answer = await bench.post(path, body)
+    assert (status, answer["code"]) == (400, "INVALID_ARGUMENT")
+    assert f"{path}:{why}" in answer["message"]
+    assert bench.graph.asked == []
 
 
 @pytest.mark.requirement("P-20", "R-25")
-def test_the_plan_that_waits_is_confirmed_or_rejected_from_the_page() -> None:
-    async def test(bench: Bench) -> None:
-        await bench.post("/pick", {"label": "red", "confirm": True})
-        await until(lambda: bench.graph.asked)
-        status, answer = await bench.post("/confirm", {"plan_id": "4adc", "accept": True})
-        assert (status, answer) == (200, {"success": True, "code": "OK", "message": "plan '4adc'"})
-        assert not (await bench.post("/confirm", {"plan_id": "4adc", "accept": False}))[1]["success"]
-        assert (await bench.post("/confirm", {"plan_id": "4adc", "accept": True}, token="no"))[0] == 403
-        answers = [Confirmation(plan_id="4adc", accept=accept) for accept in (True, False)]
-        assert bench.graph.asked == [Order(label="red", confirm=True), *answers]
-
-    with_bench(test)
+@with_bench
+async def test_the_plan_that_waits_is_confirmed_or_rejected_from_the_page(bench: Bench) -> None:
+    await bench.post("/pick", {"label": "red", "confirm": True})
+    await until(lambda: bench.graph.asked)
+    status, answer = await bench.post("/confirm", {"plan_id": "4adc", "accept": True})
+    assert (status, answer) == (200, {"success": True, "code": "OK", "message": "plan '4adc'"})
+    assert not (await bench.post("/confirm", {"plan_id": "4adc", "accept": False}))[1]["success"]
+    assert (await bench.post("/confirm", {"plan_id": "4adc", "accept": True}, token="no"))[0] == 403
+    answers = [Confirmation(plan_id="4adc", accept=accept) for accept in (True, False)]
+    assert bench.graph.asked == [Order(label="red", confirm=True), *answers]
 
 
-def test_what_the_graph_refuses_is_said() -> None:
-    async def test(bench: Bench) -> None:
-        assert await bench.post("/cancel", {}) == (
-            200,
-            {"success": False, "code": "REFUSED", "message": "no grasp runs"},
-        )
-        assert (await bench.post("/reset", {"scene": "demo"}))[1]["code"] == "NOT_READY"
-
-    with_bench(test)
+@with_bench
+async def test_what_the_graph_refuses_is_said(bench: Bench) -> None:
+    assert await bench.post("/cancel", {}) == (
+        200,
+        {"success": False, "code": "REFUSED", "message": "no grasp runs"},
+    )
+    assert (await bench.post("/reset", {"scene": "demo"}))[1]["code"] == "NOT_READY"
 
 
-def test_files_outside_of_the_page_are_not_there() -> None:
-    async def test(bench: Bench) -> None:
-        wrong = (
-            "/../server.py",
-            "/%2e%2e/server.py",
-            "/page/../server.py",
-            "/vendor/../../server.py",
-            "/vendor",
-            "/vendor/",
-        )
-        for path in (*wrong, "/index.html", "/nothing"):
-            assert (await bench.get(path))[0] == 404, path
-        for path in ("/view.js", "/vendor/three.module.min.js"):
-            assert (await bench.get(path))[0] == 200, path
-
-    with_bench(test)
+@with_bench
+async def test_files_outside_of_the_page_are_not_there(bench: Bench) -> None:
+    wrong = (
+        "/../server.py",
+        "/%2e%2e/server.py",
+        "/page/../server.py",
+        "/vendor/../../server.py",
+        "/vendor",
+        "/vendor/",
+    )
+    for path in (*wrong, "/index.html", "/nothing"):
+        assert (await bench.get(path))[0] == 404, path
+    for path in ("/view.js", "/vendor/three.module.min.js"):
+        assert (await bench.get(path))[0] == 200, path
 
 
 MALFORMED: dict[str, bytes] = {
@@ -382,34 +368,30 @@ MALFORMED: dict[str, bytes] = {
 }
 
 
-def test_no_malformed_request_keeps_others_from_their_answer() -> None:
-    async def test(bench: Bench) -> None:
-        known = json_body({"Authorization": f"Bearer {bench.token}", **bench.origin})
-        for path in ("/pick", "/confirm", "/reset"):
-            for name, body in MALFORMED.items():
-                async with bench.session.post(bench.url + path, data=body, headers=known) as response:
-                    text = await response.text()
-                    assert 400 <= response.status < 500, (path, name, response.status, text)
-                    assert "Traceback" not in text
-        assert bench.graph.asked == []
-        for path, status in (("/cancel", 200), ("/stop", 200), ("/release", 200), ("/reset", 200), ("/pick", 202)):
-            assert (await bench.post(path, {}))[0] == status, path
-
-    with_bench(test)
+@with_bench
+async def test_no_malformed_request_keeps_others_from_their_answer(bench: Bench) -> None:
+    known = json_body({"Authorization": f"Bearer {bench.token}", **bench.origin})
+    for path in ("/pick", "/confirm", "/reset"):
+        for name, body in MALFORMED.items():
+            async with bench.session.post(bench.url + path, data=body, headers=known) as response:
+                text = await response.text()
+                assert 400 <= response.status < 500, (path, name, response.status, text)
+                assert "Traceback" not in text
+    assert bench.graph.asked == []
+    for path, status in (("/cancel", 200), ("/stop", 200), ("/release", 200), ("/reset", 200), ("/pick", 202)):
+        assert (await bench.post(path, {}))[0] == status, path
 
 
-def test_requests_that_wait_hold_up_neither_cancel_nor_stop() -> None:
-    async def test(bench: Bench) -> None:
-        bench.graph.reset = lambda order: (bench.graph.go_on.wait(60.0), "late")  # type: ignore[method-assign]
-        waiting = [asyncio.create_task(bench.post("/reset", {})) for _ in range(40)]
-        await until(lambda: sum(task.done() for task in waiting) == 38)
-        assert {task.result()[0] for task in waiting if task.done()} == {409}
-        assert (await bench.post("/cancel", {}))[1]["message"] == "no grasp runs"
-        assert (await bench.post("/stop", {}))[1]["message"] == "the arms hold"
-        bench.graph.go_on.set()
-        assert sorted([(await task)[0] for task in waiting])[:2] == [200, 200]
-
-    with_bench(test)
+@with_bench
+async def test_requests_that_wait_hold_up_neither_cancel_nor_stop(bench: Bench) -> None:
+    bench.graph.reset = lambda order: (bench.graph.go_on.wait(60.0), "late")  # type: ignore[method-assign]
+    waiting = [asyncio.create_task(bench.post("/reset", {})) for _ in range(40)]
+    await until(lambda: sum(task.done() for task in waiting) == 38)
+    assert {task.result()[0] for task in waiting if task.done()} == {409}
+    assert (await bench.post("/cancel", {}))[1]["message"] == "no grasp runs"
+    assert (await bench.post("/stop", {}))[1]["message"] == "the arms hold"
+    bench.graph.go_on.set()
+    assert sorted([(await task)[0] for task in waiting])[:2] == [200, 200]
 
 
 # --- what is no request
@@ -445,28 +427,25 @@ def test_what_is_no_request_is_answered_without_a_traceback(case: str, caplog: p
         assert (await bench.post("/cancel", {}))[0] == 200
         assert bench.graph.asked == ["cancel"]
 
-    with_bench(test)
+    with_bench(test)()
     assert [record.getMessage() for record in caplog.records if record.exc_info] == []
 
 
-def test_connections_that_ask_nothing_keep_no_one_out(monkeypatch: pytest.MonkeyPatch) -> None:
+@with_bench
+async def test_connections_that_ask_nothing_keep_no_one_out(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """More than are taken, some silent, some in the middle of a head; a page asks meanwhile, and they are closed."""
     monkeypatch.setattr(gate, "HEAD_S", 1.0)
-
-    async def test(bench: Bench) -> None:
-        port = int(bench.url.rpartition(":")[2])
-        idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(2 * gate.MOST)]
-        for _, writer in idle[::2]:
-            writer.write(b"GET / HTTP/1.1\r\nHost: local")
-        assert (await bench.post("/stop", {}))[0] == 200
-        async with bench.socket() as socket:
-            assert json.loads((await socket.receive()).data)["kind"] == "hello"
-            async with asyncio.timeout(DEADLINE_S):
-                for reader, writer in idle:
-                    with contextlib.suppress(ConnectionError):
-                        while await reader.read(4096):
-                            pass
-                    writer.close()
-            assert not socket.closed
-
-    with_bench(test)
+    port = int(bench.url.rpartition(":")[2])
+    idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(2 * gate.MOST)]
+    for _, writer in idle[::2]:
+        writer.write(b"GET / HTTP/1.1\r\nHost: local")
+    assert (await bench.post("/stop", {}))[0] == 200
+    async with bench.socket() as socket:
+        assert json.loads((await socket.receive()).data)["kind"] == "hello"
+        async with asyncio.timeout(DEADLINE_S):
+            for reader, writer in idle:
+                with contextlib.suppress(ConnectionError):
+                    while await reader.read(4096):
+                        pass
+                writer.close()
+        assert not socket.closed

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -122,13 +123,18 @@ def table(path: Path, rows: Array, names: list[str] | None = None, header: str =
 
 def distorted(image: Array, lens: Array, border: float = 130.0) -> Array:
     """Return a picture as a lens with these coefficients of OpenCV shows it."""
-    h, w = image.shape
-    u, v = np.meshgrid(np.arange(float(w)), np.arange(float(h)))
+    at = _undistorted(image.shape, tuple(lens))
+    return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderValue=(border,))
+
+
+@cache
+def _undistorted(shape: tuple[int, int], lens: tuple[float, ...]) -> Array:
+    """Where each pixel of a picture is in that of a pinhole camera."""
+    u, v = np.meshgrid(np.arange(float(shape[1])), np.arange(float(shape[0])))
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
     stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-10)
-    rays = cv2.undistortPointsIter(pixels, K.matrix, lens, np.eye(3), K.matrix, stop)
-    at = rays.reshape(h, w, 2).astype(np.float32)
-    return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderValue=(border,))
+    rays = cv2.undistortPointsIter(pixels, K.matrix, np.array(lens), np.eye(3), K.matrix, stop)
+    return rays.reshape(*shape, 2).astype(np.float32)
 
 
 def pictures(folder: Path, known: Truth, board: Board, lens: Array | None = None) -> list[str]:

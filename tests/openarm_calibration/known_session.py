@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import cv2
@@ -31,14 +32,18 @@ class Known:
     description: RobotDescription
 
 
-def photograph(board: Board, T_camera_board: Array, optics: Intrinsics, *, mirrored: bool = False) -> Array:
+@cache
+def _drawn(board: Board, scale: float) -> Array:
+    return board.draw(scale)
+
+
+def photograph(board: Board, T_camera_board: Array, optics: Intrinsics) -> Array:
     """Return the grey picture (h, w) of a board alone, 16 samples a pixel; 0 to 255.
 
     Args:
         board: The board.
         T_camera_board: (4, 4).
         optics: Of the camera.
-        mirrored: Whether the picture is mirrored.
     """
     scale, zoom = 4000.0, 4
     w, h = board.size
@@ -47,8 +52,9 @@ def photograph(board: Board, T_camera_board: Array, optics: Intrinsics, *, mirro
     K[:2] *= zoom
     K[:2, 2] += (zoom - 1) / 2
     H = K @ T_camera_board[:3, [0, 1, 3]] @ to_board
-    picture = board.draw(scale)[:, :: -1 if mirrored else 1]
-    large = cv2.warpPerspective(picture, H, (optics.width * zoom, optics.height * zoom), borderValue=(130.0,))
+    large = cv2.warpPerspective(
+        _drawn(board, scale), H, (optics.width * zoom, optics.height * zoom), borderValue=(130.0,)
+    )
     return cv2.resize(large, (optics.width, optics.height), interpolation=cv2.INTER_AREA).astype(np.float64)
 
 

@@ -18,6 +18,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from tests.openarm_calibration import foreign_files as files
 from tests.openarm_calibration import known_session
 
 K = Intrinsics.from_fovy(640, 480, 60.0)
@@ -44,10 +45,7 @@ def seen(board: Board, T: Array, seed: int = 0, noise: float = 2.0, blur: float 
     true = project(board.points, board.radius, T, ROW)
     image = known_session.photograph(board, T, K)
     if lens is not None:
-        u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
-        pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
-        ideal = cv2.undistortPoints(pixels, K.matrix, lens, P=K.matrix).reshape(480, 640, 2).astype(np.float32)
-        image = cv2.remap(image, ideal[..., 0], ideal[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        image = files.distorted(image, lens)
         rays = np.column_stack([(true - ROW[2:]) / ROW[:2], np.ones(len(true))])
         true = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K.matrix, lens)[0].reshape(-1, 2)
     if blur:
@@ -67,7 +65,7 @@ def test_marks_are_found_to_a_few_hundredths_of_a_pixel(board: Board) -> None:
     """Any turn that the board's rule allows, tilts to 35 degrees, grey noise of 2."""
     rng = np.random.default_rng(4)
     away = []
-    while len(away) < 5:
+    while len(away) < 2:
         image, true = seen(board, pose(rng, board), len(away))
         if ((true > 12) & (true < (627, 467))).all():
             away.append(errors(board, image, true))
@@ -87,7 +85,7 @@ def test_a_lens_that_distorts_by_many_pixels_does_not_refuse_its_board(board: Bo
     assert np.sqrt(np.mean((detection.pixels - true[detection.ids]) ** 2)) < 0.08
 
 
-@pytest.mark.parametrize("blur", [1.0, 2.0, 3.5])
+@pytest.mark.parametrize("blur", [1.0, pytest.param(2.0, marks=pytest.mark.long), 3.5])
 @pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.label[:24])
 @pytest.mark.requirement("A-42")
 def test_blurred_and_noisy_pictures_are_read_rightly_or_refused(board: Board, blur: float) -> None:
@@ -143,9 +141,11 @@ def test_another_board_is_refused_in_a_sentence(shown: int, wanted: int) -> None
 @pytest.mark.parametrize("board", [b for b in BOARDS if b.kind in ("charuco", "aprilgrid", "marker")],
                          ids=lambda b: b.label[:24])  # fmt: skip
 def test_a_mirrored_picture_of_a_board_with_ids_is_refused(board: Board) -> None:
+    """The mirror image of a circle grid is the grid itself after half a turn."""
     image, _ = seen(board, se3.make(se3.rot_x(0.2), (0.0, 0.0, 0.4)))
-    with pytest.raises(OpenArmError):
+    with pytest.raises(OpenArmError) as caught:
         detect(board, np.ascontiguousarray(image[:, ::-1]))
+    assert caught.value.code == Code.NOTHING_DETECTED
 
 
 def test_a_corner_that_contradicts_the_others_is_left_out() -> None:

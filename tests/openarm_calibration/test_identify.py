@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from openarm_calibration.dynamics import excite
 from openarm_calibration.dynamics.excite import AMPLITUDE, postures, waves
 from openarm_calibration.dynamics.identify import ServoLog, identify
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servo_store import ServoStore
 from openarm_common.robot.servos import ArmLoad
+from openarm_evaluation.campaign import dynamics
 from openarm_evaluation.campaign.dynamics import DynamicsBench
 from openarm_sim_bridge.world.hardware import HardwareConfig, drawn
 
@@ -24,15 +26,28 @@ def load() -> ArmLoad:
     return ArmLoad(description, description.arm_joints("right"), description.tcp_link("right"))
 
 
+SHIPPED, GAINS = HardwareConfig(mass_error=0.0).of_seed(31), HardwareConfig(mass_error=0.0, gain_error=0.3).of_seed(32)
+BOTH = ("left", "right")
+
+
 @pytest.mark.parametrize(
-    "hardware",
-    [HardwareConfig(mass_error=0.0).of_seed(31), HardwareConfig(mass_error=0.0, gain_error=0.3).of_seed(32)],
-    ids=["as shipped", "gains 30 % off"],
+    ("hardware", "sides", "places", "cycles"),
+    [
+        (SHIPPED, ("left",), 2, 4),
+        pytest.param(SHIPPED, BOTH, 6, 8, marks=pytest.mark.long),
+        pytest.param(GAINS, BOTH, 6, 8, marks=pytest.mark.long),
+    ],
+    ids=["one arm", "as shipped", "gains 30 % off"],
 )
-def test_the_servos_of_drawn_arms_are_found(hardware: HardwareConfig, tmp_path: Path) -> None:
-    description = RobotDescription.load()
+def test_the_servos_of_drawn_arms_are_found(
+    hardware: HardwareConfig, sides: tuple[str, ...], places: int, cycles: int, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(dynamics, "_POSTURES", places)
+    monkeypatch.setattr(excite, "_CYCLES", cycles)
+    description, bench = RobotDescription.load(), DynamicsBench(hardware)
     made, store = drawn(hardware, description), ServoStore(tmp_path)
-    for side, found in DynamicsBench(hardware).identified().items():
+    monkeypatch.setattr(RobotDescription, "arm_names", sides)
+    for side, found in bench.identified().items():
         joints = description.arm_joints(side)
         truth = {name: np.array([getattr(made, name)[joint] for joint in joints]) for name in ("stiffness", "friction")}
         latency = made.latency_s[joints[0]]

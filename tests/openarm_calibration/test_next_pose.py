@@ -67,7 +67,7 @@ class Arm:
         return True
 
 
-@pytest.mark.parametrize("name", ["wrist", "overhead"])
+@pytest.mark.parametrize("name", [pytest.param("wrist", marks=pytest.mark.long), "overhead"])
 @pytest.mark.requirement("N-07")
 def test_eight_proposed_poses_calibrate(name: str) -> None:
     """Nominal mount and a ruler are enough to begin; all proposals but the first few show the board; 0.3 mm, 0.03°."""
@@ -130,7 +130,7 @@ def score(arm: Arm) -> float:
     return math.sqrt(np.sum(np.diag(np.linalg.inv(information))[:6] / UNITS**2))
 
 
-@pytest.mark.parametrize("name", ["wrist", "overhead"])
+@pytest.mark.parametrize("name", ["wrist", pytest.param("overhead", marks=pytest.mark.long)])
 @pytest.mark.requirement("N-07", "A-40")
 def test_the_proposed_pose_is_more_informative_than_others_that_show_the_board(name: str) -> None:
     """By the true mounts: with a sample at the first proposal the bound is below that with one at the average other."""
@@ -155,12 +155,12 @@ def test_the_proposed_pose_is_more_informative_than_others_that_show_the_board(n
 
 @pytest.mark.requirement("R-11")
 def test_poses_that_are_chosen_for_joint_zeros_tell_them_better() -> None:
-    """Eight poses of each kind: the deviation that is left of the zeros which no mount takes up, by the true mounts."""
+    """Six poses of each kind: the deviation that is left of the zeros which no mount takes up, by the true mounts."""
     left = {}
     for zeros in (0.0, 0.02):
         arm, rng = Arm("overhead"), np.random.default_rng(0)
         search = arm.search(zeros)
-        while len(arm.samples) < 8:
+        while len(arm.samples) < 6:
             proposal = search.propose(arm.samples, arm.state)[0]
             if arm.look(proposal, rng):
                 search.learn(arm.samples)

@@ -9,6 +9,7 @@ import math
 import re
 import tracemalloc
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.verdict import assess, estimate_delay
 from openarm_calibration.sampling.gate import GateConfig, match
-from openarm_calibration.sampling.samples import load_session
+from openarm_calibration.sampling.samples import SampleSet, load_session
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
@@ -192,11 +193,11 @@ def test_the_verdict_has_held_out_errors_and_reasons(session) -> None:
     assert set(table) == {"TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS", "SHAH", "LI", "REFINED"}
 
 
-@pytest.mark.parametrize("setup", ["in_hand", "to_hand"])
+@pytest.mark.parametrize(("setup", "count"), [("in_hand", 10), pytest.param("to_hand", 15, marks=pytest.mark.long)])
 @pytest.mark.requirement("A-32")
-def test_wrong_intrinsics_fail_by_name_and_right_ones_do_not(session, setup: str) -> None:
+def test_wrong_intrinsics_fail_by_name_and_right_ones_do_not(session, setup: str, count: int) -> None:
     """A focal length 4 % off, as of another resolution or field of view."""
-    samples = session(setup, px=0.1).samples
+    samples = session(setup, count, px=0.1).samples
     solution = solve(samples.problem())
     right = assess(samples.problem(), solution)
     assert abs(right.figures["focal"] - 1.0) < 4.0 * right.figures["focal_sigma"] < 0.02
@@ -215,6 +216,15 @@ def test_wrong_intrinsics_fail_by_name_and_right_ones_do_not(session, setup: str
         match=r"the focal length seems -16\.\d+ % off.*poses that contradict each other.*the intrinsics",
     ):
         solve(samples.problem())
+
+
+def test_joint_positions_in_degrees_are_named(session) -> None:
+    known = session(count=8)
+    wrong = SampleSet(known.samples.head, known.description)
+    for sample in known.samples.samples:
+        wrong.add(replace(sample, joints={name: math.degrees(q) for name, q in sample.joints.items()}))
+    with pytest.raises(OpenArmError, match="the joint positions are in degrees where radians are expected"):
+        solve(wrong.problem())
 
 
 def test_an_unknown_link_in_a_session_lists_the_links(session) -> None:

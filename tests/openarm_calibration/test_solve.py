@@ -42,8 +42,15 @@ def test_an_unknown_method_lists_the_methods() -> None:
         closed_form("tsay", "in_hand", np.zeros((3, 4, 4)), np.zeros((3, 4, 4)))
 
 
-@pytest.mark.parametrize("setup", SETUPS)
-@pytest.mark.parametrize("robot", [(0.0, 0.0), ROBOT])
+@pytest.mark.parametrize(
+    ("setup", "robot"),
+    [
+        ("in_hand", ROBOT),
+        ("to_hand", (0.0, 0.0)),
+        pytest.param("in_hand", (0.0, 0.0), marks=pytest.mark.long),
+        pytest.param("to_hand", ROBOT, marks=pytest.mark.long),
+    ],
+)
 def test_refinement_reaches_the_bound_and_its_covariance_is_honest(setup: str, robot: tuple[float, float]) -> None:
     """40 trials of 8 poses: rms error near the Cramér-Rao bound, NEES near 6, far below the best closed form."""
     rng = np.random.default_rng([setup == "in_hand", robot[0] > 0])
@@ -78,10 +85,10 @@ def test_noise_is_estimated_from_the_data() -> None:
 
 @pytest.mark.parametrize("robot", [(0.0, 0.0), ROBOT], ids=["exact", "robot"])
 def test_the_covariance_is_honest_where_few_poses_must_give_the_noise_too(robot: tuple[float, float]) -> None:
-    """60 trials of 6 poses, nothing known beforehand: NEES near 6, and 95 % regions that hold nearly that often."""
+    """30 trials of 6 poses, nothing known beforehand: NEES near 6, and 95 % regions that hold nearly that often."""
     rng = np.random.default_rng([12, robot[0] > 0])
     nees = []
-    for k in range(60):
+    for k in range(30):
         truth = synthetic.trial(SETUPS[k % 2], 6, Noise(0.3, *robot), rng)
         solution = solve(truth.problem, LAX)
         away = difference(solution.estimate.X[0], truth.X)
@@ -107,10 +114,10 @@ def test_scale_and_intrinsics_come_out_right() -> None:
 
 @pytest.mark.parametrize("setup", SETUPS)
 def test_one_gross_outlier_among_twelve_is_named_and_does_no_harm(setup: str) -> None:
-    """A wrong robot pose: named; the error stays within 1.3 of that without it (rms of 10 trials)."""
+    """A wrong robot pose: named; the error stays within 1.3 of that without it (rms of 4 trials)."""
     rng = np.random.default_rng(6)
     clean_error, error = [], []
-    for _ in range(10):
+    for _ in range(4):
         truth = synthetic.trial(setup, 12, Noise(0.3, *ROBOT), rng)
         bad = int(rng.integers(12))
         clean = solve(truth.problem.subset([i for i in range(12) if i != bad]))
@@ -155,12 +162,13 @@ def test_degenerate_sets_are_refused_by_name(setup: str, kind: str, name: str) -
     assert caught.value.code == Code.DEGENERATE
 
 
+@pytest.mark.parametrize("sets", [8, pytest.param(60, marks=pytest.mark.long)])
 @pytest.mark.requirement("A-41")
-def test_nearly_degenerate_sets_are_refused_or_right() -> None:
-    """60 sets of every kind with small free rotations: no silent wrong result, no NaN (the benchmark runs 1000)."""
-    rng = np.random.default_rng(9)
+def test_nearly_degenerate_sets_are_refused_or_right(sets: int) -> None:
+    """Sets of every kind with small free rotations: no silent wrong result, no NaN (the benchmark runs 1000)."""
     refused = 0
-    for k in range(60):
+    for k in range(sets):
+        rng = np.random.default_rng([9, k])
         kind = synthetic.DEGENERATE[k % 4]
         setup = SETUPS[k // 4 % 2]
         truth = synthetic.degenerate(kind, setup, rng, math.radians(10.0 ** rng.uniform(-3, 1)))
@@ -172,7 +180,7 @@ def test_nearly_degenerate_sets_are_refused_or_right() -> None:
         away = difference(solution.estimate.X[0], truth.X)
         assert np.isfinite(away).all()
         assert away @ np.linalg.solve(solution.mount_covariance(), away) < 60.0
-    assert 10 < refused < 60
+    assert sets / 6 < refused < sets
 
 
 def test_numbers_that_are_not_finite_are_refused() -> None:

@@ -39,7 +39,7 @@ def erring(known: Known) -> Erring:
 
 def test_both_set_ups_in_one_solve_give_each_camera_its_result(session) -> None:
     """Errors stay within the predicted ones; six poses of one camera learn the robot's errors from the other's."""
-    wrist, overhead = session("in_hand", 15, px=0.2, seed=3), session("to_hand", 6, px=0.2, seed=4)
+    wrist, overhead = session("in_hand", 12, px=0.2, seed=3), session("to_hand", 6, px=0.2, seed=4)
     sets = [erring(wrist), erring(overhead)]
     results = calibrate_together(sets, hashes=["a", "b"], created="now")
     for known, result, digest in zip((wrist, overhead), results, "ab", strict=True):

@@ -41,11 +41,11 @@ def altered(mine: Path, **changes: object) -> None:
 
 def test_a_robot_of_another_name_is_read_from_its_folder(robots, monkeypatch):
     assert folder.robot_names() == ("mine",)
-    robot = RobotDescription.from_folder("mine")
+    monkeypatch.setenv(folder.ROBOT, "mine")
+    robot = RobotDescription.load()
     assert robot.name == "mine"
     assert robot.arm_names == ("left", "right")
-    monkeypatch.setenv(folder.ROBOT, "mine")
-    assert RobotDescription.load() is RobotDescription.load("mine")
+    assert robot is RobotDescription.load("mine")
 
 
 def test_a_robot_that_is_not_there_is_refused_with_those_that_are(robots):

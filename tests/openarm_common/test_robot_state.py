@@ -66,7 +66,7 @@ def off(buffer: RobotStateBuffer, motion: Callable[[Array], Array], t_ns: int) -
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(8.0, 200.0), st.booleans(), st.sampled_from(["waves", "strokes"]))
-@settings(max_examples=80)
+@settings(max_examples=25)
 @pytest.mark.requirement("A-44", "A-72")
 def test_what_is_accepted_is_within_a_millimetre_at_the_hand(seed: int, rate: float, measured: bool, kind: str) -> None:
     """Smooth random motions of any size and speed: waves up to 3 Hz, strokes from rest to rest."""

@@ -26,15 +26,17 @@ PENDULUM = """<robot name="r">
 pytestmark = pytest.mark.requirement("R-08")
 
 
-@pytest.mark.parametrize("name", ["openarm_v1", "openarm_v2", "panda"])
-def test_postures_that_the_exact_layer_calls_free_are_free_and_those_that_touch_are_found(name: str) -> None:
+@pytest.mark.parametrize(("name", "states"), [("openarm_v1", 60), ("openarm_v2", 60), ("panda", 120)])
+def test_postures_that_the_exact_layer_calls_free_are_free_and_those_that_touch_are_found(
+    name: str, states: int
+) -> None:
     robot = RobotDescription.load(name)
     names = [joint for arm in robot.arms.values() for joint in arm.controlled]
     checks = SelfCollision(robot, names)
     arms = {arm: CollisionRobot(robot, ArmKinematics(robot, parts.tcp)) for arm, parts in robot.arms.items()}
     low, high = robot.limits(names)
     found = {True: 0, False: 0}
-    for q in np.random.default_rng(5).uniform(low, high, (120, len(names))):
+    for q in np.random.default_rng(5).uniform(low, high, (states, len(names))):
         state = dict(zip(names, q.tolist(), strict=True))
         hit = False
         for seen in arms.values():

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import Code
@@ -289,6 +289,7 @@ def test_position_commands_are_ignored_while_a_trajectory_runs() -> None:
     np.testing.assert_allclose(arm.q, [0.5, -0.5])
 
 
+@settings(max_examples=25)
 @given(target=st.floats(-3.0, 3.0), v=st.floats(0.1, 5.0), a=st.floats(0.5, 50.0))
 def test_the_tracker_arrives_without_overshoot(target: float, v: float, a: float) -> None:
     tracker, goal = Tracker([0.0], [v], [a]), np.array([target])

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import Code
@@ -126,6 +126,7 @@ def test_bad_trajectories_are_refused_with_joint_and_value(
 numbers = st.floats(-2.0, 2.0)
 
 
+@settings(max_examples=30)
 @given(
     q=st.lists(st.tuples(numbers, numbers), min_size=2, max_size=6),
     v=st.lists(st.tuples(numbers, numbers), min_size=6, max_size=6),

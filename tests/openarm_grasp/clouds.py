@@ -51,13 +51,15 @@ def seen(parts: list[Array], camera: Array = ABOVE, step: float = 0.0018) -> Arr
     along = (aims - camera) / np.linalg.norm(aims - camera, axis=1, keepdims=True)
     best = np.full(len(along), np.inf)
     for part in parts:
+        shadow = camera + (part - camera) * ((TABLE_Z - camera[2]) / (part[:, 2:] - camera[2]))
+        on = ((aims >= shadow.min(axis=0) - 1e-6) & (aims <= shadow.max(axis=0) + 1e-6)).all(axis=1)
         e = ConvexHull(part).equations
-        rate, value = along @ e[:, :3].T, e[:, :3] @ camera + e[:, 3]
+        rate, value = along[on] @ e[:, :3].T, e[:, :3] @ camera + e[:, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             at = -value / rate
         enter = np.where(rate < 0.0, at, -np.inf).max(axis=1)
         leave = np.where(rate > 0.0, at, np.inf).min(axis=1)
-        best = np.where((enter <= leave) & (enter > 0.0), np.minimum(best, enter), best)
+        best[on] = np.where((enter <= leave) & (enter > 0.0), np.minimum(best[on], enter), best[on])
     hit = np.isfinite(best)
     return camera + best[hit, None] * along[hit]
 

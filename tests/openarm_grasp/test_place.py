@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common import se3
@@ -29,6 +29,7 @@ def box(x=0.26, y=-0.2, yaw=0.3, size=(0.04, 0.06, 0.05), label="red") -> Detect
     return Detection(label, 0.9, se3.make(se3.rot_z(yaw), (x, y, 0.4 + size[2] / 2.0)), np.array(size))
 
 
+@settings(max_examples=25)
 @given(st.floats(-3.0, 3.0), st.integers(0, 27), st.floats(0.16, 0.36), st.floats(-0.42, -0.06))
 def test_the_object_keeps_its_place_in_the_hand(yaw, which, x, y):
     target = box(yaw=yaw)
@@ -67,6 +68,7 @@ def hands_there(target: Detection, candidate: GraspCandidate, yaw: float | None)
     return {tuple(np.round(way.T_base_tcp[:3].ravel(), 6) + 0.0) for way in ways}
 
 
+@settings(max_examples=15)
 @given(st.sampled_from([box(), box(size=(0.05, 0.05, 0.05)), replace(box(size=(0.05, 0.05, 0.05)), round=True)]),
        st.sampled_from([None, 0.8]), st.integers(0, 27))  # fmt: skip
 def test_grasps_with_which_the_hand_could_not_stand_otherwise_are_left_out(target, yaw, which):

@@ -96,7 +96,7 @@ measured = st.tuples(st.floats(-0.10, 0.10), st.integers(0, 3), st.floats(-0.002
 failures = st.sampled_from([Code.GRASP_MISSED, Code.HAND_COLLISION, Code.GRASP_LOST])
 
 
-@settings(max_examples=15)
+@settings(max_examples=5)
 @given(
     yaw=st.floats(-np.pi, np.pi),
     looks=st.lists(measured, min_size=6, max_size=6),

@@ -66,11 +66,6 @@ def test_the_gap_after_closing_is_the_reference_for_slip():
     assert grip(0.0155, was_held=True, closed=0.0172).ok  # no longer the interval
 
 
-def test_a_prism_is_judged_by_its_width_as_before():
-    assert judge_grip(Evidence(0.036, 0.03, -30.0, 0.0), HELD).code is Code.HAND_COLLISION
-    assert judge_grip(Evidence(0.034, 0.03, -30.0, 0.0), HELD).ok
-
-
 def frame(*clusters, in_view=True):
     return ClusterFrame(0, clusters, in_view)
 

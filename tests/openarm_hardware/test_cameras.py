@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_hardware.cameras import feed as feeds
 from openarm_hardware.cameras.config import UsbConfig
 from openarm_hardware.cameras.feed import CameraFeed
 from openarm_hardware.cameras.rectify import Rectifier
@@ -152,7 +153,8 @@ class Scripted:
         self.closed += 1
 
 
-def test_a_camera_that_is_absent_unplugged_or_silent_is_opened_again() -> None:
+def test_a_camera_that_is_absent_unplugged_or_silent_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feeds, "_RETRY_S", 0.01)
     came, enough = [], threading.Event()
     camera = Scripted(["absent", "broken", "unplugged", "silent"])
     faults = set[str]()

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.motors.bus import SocketBus
@@ -61,6 +61,7 @@ def test_what_is_half_written_is_not_read(both: tuple[Exchange, Exchange]) -> No
     assert reader.read_command() is None  # a writer that died while it wrote
 
 
+@settings(max_examples=30)
 @given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=80), st.booleans())
 def test_a_bus_carries_frames_in_order(frames: list[tuple[int, bytes]], flexible: bool) -> None:
     a, b = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -153,11 +153,17 @@ def test_a_client_that_dies_leaves_arms_that_are_held_and_then_released(rig: Rig
     assert not any(rig.ask()[axis.joint]["on"] for axis in rig.axes)
 
 
-def test_a_new_client_takes_over_arms_that_are_held_without_letting_them_go(rig: Rig) -> None:
-    first = rig.up()
+@pytest.mark.long
+def test_a_second_client_is_refused(rig: Rig) -> None:
+    """After the time that the first may take to give the buses up."""
+    rig.up()
     with pytest.raises(OpenArmError, match="in use by another process") as refusal:
         rig.servo()
     assert refusal.value.code is Code.BUSY
+
+
+def test_a_new_client_takes_over_arms_that_are_held_without_letting_them_go(rig: Rig) -> None:
+    first = rig.up()
     first.abandon()
     second = rig.up()
     assert not first.alive
@@ -166,6 +172,7 @@ def test_a_new_client_takes_over_arms_that_are_held_without_letting_them_go(rig:
     assert second.alive
 
 
+@pytest.mark.long
 def test_motors_of_a_servo_that_dies_switch_themselves_off_and_a_new_one_says_so(rig: Rig) -> None:
     servo = rig.up()
     os.kill(servo.pid, signal.SIGKILL)

@@ -20,6 +20,7 @@ from openarm_common.motors.bus import emulated_buses
 from openarm_common.motors.wiring import axes_of, load_wiring
 from openarm_common.robot.description import RobotDescription
 from openarm_control.joints import arm_loads
+from openarm_hardware import jog
 from openarm_hardware.jog import Jog
 from openarm_hardware.touch import TouchGuard
 from openarm_hardware.upkeep import changed, gains, read_gains, zeros
@@ -85,14 +86,15 @@ def test_motors_that_are_commanded_or_silent_get_no_zero(rig: RobotRig) -> None:
     assert busy.value.code is Code.BUSY
 
 
-def test_a_joint_is_moved_there_and_back_and_the_others_stay(rig: RobotRig) -> None:
+def test_a_joint_is_moved_there_and_back_and_the_others_stay(rig: RobotRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jog, "_REST_S", 0.2)
     axes = arm_of(rig)
     robot = rig.description
     guard = TouchGuard(SelfCollision(robot, [axis.joint for axis in axes]))
     load: Any = NoLoad()
-    found = Jog(axes, axes[3].joint, load, guard, replace(PATIENT, release_s=0.1)).run(math.radians(8.0))
+    found = Jog(axes, axes[3].joint, load, guard, replace(PATIENT, release_s=0.1)).run(math.radians(5.0))
     assert found.start == pytest.approx(START, abs=0.01)
-    assert found.there - found.start == pytest.approx(math.radians(8.0), abs=0.03)
+    assert found.there - found.start == pytest.approx(math.radians(5.0), abs=0.02)
     assert found.back == pytest.approx(found.start, abs=0.03)
     assert found.others < 0.03
     rows = rig.ask()
@@ -128,8 +130,8 @@ def test_a_jog_ends_when_a_motor_fails(rig: RobotRig) -> None:
 
 
 def test_what_is_set_in_the_motors_is_recorded_and_compared(rig: RobotRig, tmp_path: Path) -> None:
-    found = gains(rig.made, flexible=True)
-    assert set(found) == {axis.joint for axis in rig.made}
+    found = gains(rig.made[:2], flexible=True)
+    assert set(found) == {axis.joint for axis in rig.made[:2]}
     first = found[rig.made[0].joint]
     assert first["KP_ASR"] == pytest.approx(0.00372)
     assert {"PMAX", "OC_VALUE", "SW_VER", "KI_APR"} <= first.keys()
@@ -149,7 +151,7 @@ def test_what_is_set_in_the_motors_is_recorded_and_compared(rig: RobotRig, tmp_p
 def test_commands_ask_before_they_set_a_zero_and_say_what_they_changed(
     rig: RobotRig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(commands, "_axes", lambda *, emulated: (rig.description, rig.made))
+    monkeypatch.setattr(commands, "_axes", lambda *, emulated: (rig.description, arm_of(rig)[3:4]))
     monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path))
     joint = arm_of(rig)[3].joint
     asked = commands.zero(joint, emulated=True)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -13,9 +14,12 @@ from scipy.interpolate import BPoly
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
 from openarm_common.robot.description import RobotDescription
+from openarm_motion.collision.exact import CollisionScene
+from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.dual_arm import DualArmScene
 from openarm_motion.timing.trajectory import JointLimits, Trajectory
 
 # arms of other builds: name, origin and axis in the frame before, lower and upper limit
@@ -113,6 +117,14 @@ def straight() -> RobotDescription:
     return RobotDescription.from_urdf(_serial("straight", _SRS))
 
 
+def both_layers(fast: FastScene, exact: CollisionScene | DualArmScene, states: np.ndarray) -> tuple[int, int]:
+    """How many states are free by the fast layer and by the exact one; the fast one is never more generous."""
+    free = fast.free_many(states)
+    truth = np.array([not exact.collides(q) for q in states])
+    assert not np.any(free & ~truth)
+    return int(np.sum(free)), int(np.sum(truth))
+
+
 def down(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
     """Tool pose that looks straight down with the opening axis at `yaw` in the plane."""
     from openarm_common import se3
@@ -132,20 +144,20 @@ def shares_of_limits(trajectory: Trajectory, limits: JointLimits) -> list[float]
         rate = curve.derivative(k)
         shares = np.abs(rate.c).max(axis=0) / limit
         for i, joint in np.argwhere(shares > 1.0):
-            c = BPoly(rate.c[:, i : i + 1, joint], [0.0, 1.0])
-            power = np.polynomial.Polynomial(_powers(c.c[:, 0]))
-            turns = power.deriv().roots()
+            power = _powers(len(rate.c) - 1) @ rate.c[:, i, joint]
+            turns = np.roots(np.polyder(power))
             inner = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0.0) & (turns.real < 1.0)]
-            shares[i, joint] = np.abs(power(np.concatenate([[0.0, 1.0], inner]))).max() / limit[joint]
+            shares[i, joint] = np.abs(np.polyval(power, [0.0, 1.0, *inner])).max() / limit[joint]
         found.append(float(shares.max()))
     return found
 
 
-def _powers(bernstein: np.ndarray) -> np.ndarray:
-    """Factors of the powers of u of a polynomial in Bernstein form."""
-    u = np.polynomial.Polynomial([0.0, 1.0])
-    n = len(bernstein) - 1
-    return sum(float(c) * math.comb(n, k) * u**k * (1 - u) ** (n - k) for k, c in enumerate(bernstein)).coef
+@functools.cache
+def _powers(n: int) -> np.ndarray:
+    """From the Bernstein form of a polynomial of degree n to the factors of its powers, the highest first."""
+    return np.array(
+        [[(-1) ** (j - i) * math.comb(n, j) * math.comb(j, i) for i in range(n + 1)] for j in range(n, -1, -1)], float
+    )
 
 
 def ruckig_duration(length: float, most: np.ndarray) -> float:

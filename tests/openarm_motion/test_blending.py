@@ -44,7 +44,7 @@ def in_box(trajectory: Trajectory, waypoints: np.ndarray) -> bool:
 @pytest.mark.requirement("R-31")
 @pytest.mark.parametrize("sides", [("right",), ("left", "right")])
 @given(data=st.data(), scale=st.sampled_from([0.1, 0.5, 1.0]), how=st.sampled_from(["blended", "stops", "quintic"]))
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_limits_hold_everywhere_for_one_arm_and_both(
     arms: dict[str, Arm],
     sides: tuple[str, ...],
@@ -69,7 +69,7 @@ def test_limits_hold_everywhere_for_one_arm_and_both(
         assert trajectory.duration <= time_polyline(group.names, waypoints, limits).duration + 1e-6
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(corners(3))
 def test_a_corner_that_is_rounded_less_is_nearer_to_the_path_and_at_last_on_it(waypoints: np.ndarray) -> None:
     timing = PolylineTiming("blended", NAMES, waypoints, LIMITS, 0.02)
@@ -130,8 +130,8 @@ def test_corners_of_plans_are_rounded_only_where_the_exact_layer_agrees(right: A
     boxes.append(box_from("board", (0.40, 0.0, 0.85), (0.25, 1.0, 0.03)))
     scene = right.scene(home, boxes)
     rng = np.random.default_rng(31)
-    states = rng.uniform(right.kinematics.lower, right.kinematics.upper, (400, 7))
-    states = [q for q in states if not scene.collides(q)][:24]
+    drawn = rng.uniform(right.kinematics.lower, right.kinematics.upper, (400, 7))
+    states = itertools.islice((q for q in drawn if not scene.collides(q)), 24)
     corners = gained = 0
     for start, goal in itertools.pairwise(states):
         plan = right.plan_validated(scene, StartState(home, start), goal[None], 5.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both arms on their way at once, kept apart."""
+"""Both arms planned as one, and on their way at once, kept apart."""
 
 from __future__ import annotations
 
@@ -109,6 +109,29 @@ def test_a_goal_of_both_that_can_not_be_names_the_pair(both, home) -> None:
         assert caught.value.code == Code.IN_COLLISION
 
 
+@pytest.mark.requirement("A-74")
+def test_one_arm_fine_but_two_collide(both, home) -> None:
+    left, right = (hand_at(arm, home, 0.0)[0] for arm in both.arms)
+    scene = both.scene(home)
+    start = starting(both, home).start
+    assert scene.contacts(start) == []
+    assert not scene.collides(np.concatenate([left, start[7:]]))
+    assert not scene.collides(np.concatenate([start[:7], right]))
+    together = np.concatenate([left, right])
+    assert scene.collides(together)
+    contact = scene.contacts(together)[0]
+    assert {contact.first.split("_")[1], contact.second.split("_")[1]} == {"left", "right"}
+    assert contact.required == pytest.approx(0.025)
+
+
+def test_an_obstacle_of_the_second_arm_is_seen(both, home) -> None:
+    start = starting(both, home).start
+    hand = both.arms[1].kinematics.fk(start[7:])[:3, 3]
+    scene = both.scene(home, [box_from("post", hand, (0.05, 0.05, 0.05))])
+    assert scene.collides(start)
+    assert "post" in {c.second for c in scene.contacts(start)}
+
+
 def test_separation_is_that_of_every_look(both, home) -> None:
     state, goals = swapping(both, home)
     whole = joined(both, plan_together(both, starting(both, state), goals, 10.0).trajectories)
@@ -148,8 +171,9 @@ def test_separation_is_the_least_of_all_pairs(both, home) -> None:
 def test_corners_of_both_arms_are_rounded_and_keep_apart(both, home) -> None:
     posts = [box_from(f"post{i}", (0.36, y, 0.65), (0.03, 0.03, 0.5)) for i, y in enumerate((-0.42, -0.2, 0.2))]
     scene = both.scene(home, posts)
-    rng = np.random.default_rng(31)
-    states = [q for q in rng.uniform(both.lower, both.upper, (1500, 14)) if not scene.collides(q)][:14]
+    rng = np.random.default_rng(35)
+    free = (q for q in rng.uniform(both.lower, both.upper, (1500, 14)) if not scene.collides(q))
+    states = itertools.islice(free, 14)
     for a, b in itertools.pairwise(states):
         state = {**home, **dict(zip(both.names, a.tolist(), strict=True))}
         first, second = both.parts(b)

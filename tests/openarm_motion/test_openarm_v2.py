@@ -11,10 +11,9 @@ from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.solids import box_from
 from openarm_motion.config import MotionConfig
-from openarm_motion.kinematics.chain import ArmKinematics
-from openarm_motion.kinematics.srs import SrsArm
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.moves import RequestBoxes, to_pose
+from tests.openarm_motion.conftest import both_layers
 
 TABLE = box_from("table", (0.46, 0.0, 0.43), (0.7, 1.2, 0.04))  # its top is at 0.45 m
 
@@ -27,18 +26,6 @@ def robot() -> RobotDescription:
 @pytest.fixture(scope="module", params=["left", "right"])
 def arm(request: pytest.FixtureRequest, robot: RobotDescription) -> Arm:
     return Arm(request.param, robot, MotionConfig(), [TABLE])
-
-
-@pytest.mark.requirement("B-07")
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_a_configuration_is_found_again_from_its_pose_swivel_and_branch(robot, side):
-    chain = ArmKinematics(robot, robot.tcp_link(side))
-    solver = SrsArm(chain)
-    for q in np.random.default_rng(2).uniform(chain.lower, chain.upper, (200, 7)):
-        found = solver.classify(q)
-        again = solver.solve(chain.fk(q), found.swivel, found.branch)
-        assert again is not None
-        np.testing.assert_allclose(again, q, atol=1e-6)
 
 
 @pytest.mark.requirement("B-13")
@@ -77,10 +64,8 @@ def test_a_pose_over_a_table_is_planned_from_home(arm):
 def test_the_fast_layer_is_never_more_generous(arm):
     exact = arm.scene({})
     states = np.random.default_rng(4).uniform(arm.kinematics.lower, arm.kinematics.upper, (400, 7))
-    free = FastScene([exact]).free_many(states)
-    truth = np.array([not exact.collides(q) for q in states])
-    assert not np.any(free & ~truth)
-    assert int(np.sum(free)) > 0.9 * int(np.sum(truth)) > 30
+    free, truth = both_layers(FastScene([exact]), exact, states)
+    assert free > 0.9 * truth > 30
 
 
 def _pad(robot: RobotDescription, finger: str) -> np.ndarray:

@@ -72,7 +72,7 @@ class Bench:
     def overlaps(self):
         """Sentences about states in which something overlaps."""
         found = []
-        for rows in list(zip(*(self.tracks[name] for name in self.arms), strict=True))[::5]:
+        for rows in list(zip(*(self.tracks[name] for name in self.arms), strict=True))[::-10]:
             state = dict(self.state)
             for arm, q in zip(self.arms.values(), rows, strict=True):
                 state.update(zip(arm.names, q, strict=True))
@@ -102,8 +102,10 @@ def test_a_twist_moves_the_tool_as_it_says(arms, home):
     assert bench.said["right"] == {Status.NO_WARNING}
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_both_arms_jogged_at_random_among_bodies_touch_nothing(arms, home, seed):
+@pytest.mark.parametrize(
+    ("seed", "ticks"), [(1, 240), *(pytest.param(k, 900, marks=pytest.mark.long) for k in range(2))]
+)
+def test_both_arms_jogged_at_random_among_bodies_touch_nothing(arms, home, seed, ticks):
     rng = np.random.default_rng(seed)
     free = Bench(arms, home)
     bodies = [
@@ -115,7 +117,7 @@ def test_both_arms_jogged_at_random_among_bodies_touch_nothing(arms, home, seed)
     bodies = [b for b in bodies if not any(b.id in text for text in bench.overlaps())]
     bench = Bench(arms, home, bodies)
 
-    for k in range(900):
+    for k in range(ticks):
         if k % 60 == 0:
             commands = {
                 name: rng.uniform(-0.5, 0.5, 7) if rng.random() < 0.4 else rng.uniform(-0.5, 0.5, 6) for name in arms
@@ -132,7 +134,7 @@ def test_at_full_speed_towards_the_table_an_arm_slows_and_stops_over_it(arms, ho
     bench = Bench(arms, home, held={"left": (), "right": boxes})
     top = table.T[2, 3] + 0.5 * table.size[2]
 
-    for _ in range(600):
+    for _ in range(300):
         bench.tick({"right": towards(np.array([0.0, 0.0, -1.0]))})
 
     assert bench.overlaps() == []
@@ -143,7 +145,7 @@ def test_at_full_speed_towards_the_table_an_arm_slows_and_stops_over_it(arms, ho
 def test_arms_sent_towards_each_other_stop_apart(arms, home):
     bench = Bench(arms, home)
 
-    for _ in range(500):
+    for _ in range(150):
         way = bench.tool("left") - bench.tool("right")
         bench.tick({"right": towards(way), "left": towards(-way)})
 
@@ -156,7 +158,7 @@ def test_a_joint_stops_before_its_limit(arms, home):
     velocity = np.zeros(7)
     velocity[4] = 0.5
 
-    for _ in range(900):
+    for _ in range(450):
         bench.tick({"left": velocity})
 
     arm = arms["left"]
@@ -170,7 +172,7 @@ def test_set_points_keep_velocity_acceleration_and_jerk(arms, home):
     arm = arms["right"]
     limits = arm.limits(1.0)
 
-    for k in range(400):
+    for k in range(200):
         if k % 40 == 0:
             twist = rng.uniform(-0.4, 0.4, 6)
         bench.tick({"right": twist})
@@ -207,12 +209,12 @@ def test_when_commands_cease_the_set_point_begins_to_slow_within_50_ms_and_every
 
 def test_a_stretched_arm_stops_at_the_singular_posture_and_comes_back(arms, home):
     bench = Bench(arms, home)
-    for _ in range(700):
+    for _ in range(250):
         bench.tick({"right": towards(np.array([1.0, -0.2, 0.3]))})
     assert bench.said["right"] & {Status.HALT_FOR_SINGULARITY, Status.JOINT_BOUND}
     out = bench.tool("right")
 
-    for _ in range(300):
+    for _ in range(150):
         bench.tick({"right": towards(np.array([-1.0, 0.2, -0.3]))})
 
     assert np.linalg.norm(bench.tool("right") - out) > 0.03

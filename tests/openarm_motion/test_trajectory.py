@@ -37,7 +37,7 @@ def assert_within_limits(trajectory: Trajectory, limits: JointLimits) -> None:
     np.testing.assert_allclose(np.diff(v, axis=0) / h, 0.5 * (a[1:] + a[:-1]), atol=0.05)
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(
     st.lists(st.lists(st.floats(-1.5, 1.5), min_size=7, max_size=7), min_size=2, max_size=4),
     st.floats(0.1, 1.0),
@@ -111,7 +111,7 @@ def test_no_way_is_a_rest() -> None:
     np.testing.assert_array_equal(trajectory.at(0.5)[0], [q])
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(st.floats(1e-6, 10), st.floats(1e-2, 10), st.floats(1e-2, 50), st.floats(1e-1, 500))
 def test_a_profile_goes_its_length_within_its_limits(length: float, v: float, a: float, j: float) -> None:
     way = profile(length, v, a, j)

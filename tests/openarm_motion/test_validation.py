@@ -33,7 +33,7 @@ def test_a_validation_finds_what_a_check_of_every_state_finds_with_far_fewer_che
 ) -> None:
     group = arms["right"] if len(sides) == 1 else DualArm(arms["left"], arms["right"])
     rng, looks, every, free = np.random.default_rng(17), 0, 0, []
-    for _ in range(12):
+    for _ in range(6):
         boxes = [box_from(f"box{k}", rng.uniform((0.2, -0.5, 0.4), (0.6, 0.5, 0.9)), (0.1, 0.1, 0.1)) for k in range(4)]
         scene = group.scene(home, boxes)
         collides = scene.collides
@@ -65,7 +65,7 @@ def test_a_validation_finds_what_a_check_of_every_state_finds_with_far_fewer_che
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=30)
+@settings(max_examples=8)
 def test_pairs_come_nearer_by_no_more_than_their_swings(
     arms: dict[str, Arm], home: dict[str, float], seed: int
 ) -> None:

@@ -108,7 +108,7 @@ def test_a_cloud_gives_the_same_map_as_its_image(accumulated, reference) -> None
     np.testing.assert_array_equal(grid.blocks.log_odds(), accumulated.blocks.log_odds())
 
 
-@settings(max_examples=40)
+@settings(max_examples=12)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_every_ray_is_free_up_to_its_end(seed: int, limited: bool) -> None:
     """Any pose, any image: cells on the way to a surface (sampled) are free unless a surface is in them."""
@@ -276,17 +276,20 @@ def test_decay_forgets_what_was_not_observed() -> None:
     assert grid.counts()["occupied"] == 0
 
 
-def test_load_replaces_the_map_and_another_resolution_is_refused(accumulated, reference, tmp_path) -> None:
-    grid = OccupancyGrid(liboctomap())
-    write_file(tmp_path / "map.ot", accumulated.full(), 0.02)
+def test_load_replaces_the_map_and_another_resolution_is_refused(tmp_path) -> None:
+    saved, grid = OccupancyGrid(liboctomap(**SMALL)), OccupancyGrid(liboctomap(**SMALL))
+    saved.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 0)
+    grid.clear_box((-0.1, -0.1, 0.2), (0.1, 0.1, 0.3), OCCUPIED)
+    write_file(tmp_path / "map.ot", saved.full(), 0.02)
     assert grid.load(read_file(tmp_path / "map.ot")) == 0
-    np.testing.assert_array_equal(grid.blocks.log_odds(), accumulated.blocks.log_odds())
-    np.testing.assert_array_equal(grid.blocks.states(), accumulated.blocks.states())
+    assert grid.counts()["occupied"] > 0
+    np.testing.assert_array_equal(grid.blocks.log_odds(), saved.blocks.log_odds())
+    np.testing.assert_array_equal(grid.blocks.states(), saved.blocks.states())
     coarse = OccupancyGrid(GridConfig(resolution=0.05, **SMALL))
     coarse.clear_box((0, 0, 0), (0.1, 0.1, 0.1))
     before = coarse.blocks.states()
     with pytest.raises(OpenArmError, match=r"cells of 0\.02 m, expected 0\.05 m"):
-        coarse.load(read_file(reference.data / "reference.bt"))
+        coarse.load(read_file(tmp_path / "map.ot"))
     np.testing.assert_array_equal(coarse.blocks.states(), before)
 
 
@@ -307,7 +310,7 @@ def test_scans_that_do_not_fit_are_refused_by_name(depth, intrinsics, T, code) -
     assert error.value.code == code
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.data())
 @pytest.mark.requirement("B-28")
 def test_no_image_harms_the_map(data) -> None:

@@ -34,7 +34,7 @@ def step(flying: bool = True) -> np.ndarray:
     return depth
 
 
-@settings(max_examples=30)
+@settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 0.02, 0.05]))
 @pytest.mark.requirement("A-50")
 def test_one_point_a_cell_on_an_absolute_lattice(seed: int, edge: float) -> None:

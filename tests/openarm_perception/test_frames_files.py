@@ -115,7 +115,7 @@ def test_other_pcd_files_are_refused(tmp_path, change, said):
 
 
 @given(st.binary(max_size=200), st.integers(0, 300))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_damaged_lzf_neither_reads_nor_writes_beyond(data, size):
     guarded = np.full(size + 16, 7, np.uint8)
     written_bytes = unpack_lzf(np.frombuffer(data, np.uint8), guarded[:size])
@@ -124,7 +124,7 @@ def test_damaged_lzf_neither_reads_nor_writes_beyond(data, size):
 
 
 @given(st.binary(min_size=8, max_size=300))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_lzf_comes_back(data):
     out = np.empty(len(data), np.uint8)
     assert unpack_lzf(np.frombuffer(pack_lzf(data), np.uint8), out) == len(data)

@@ -34,7 +34,7 @@ METRES = SHAPES.flatmap(
 MILLIMETRES = SHAPES.flatmap(lambda shape: hnp.arrays(np.uint16, shape))
 
 
-@settings(max_examples=150)
+@settings(max_examples=50)
 @given(METRES | MILLIMETRES, st.integers(0, 1), st.integers(0, 1), st.sampled_from([0, 3, 5]))
 @pytest.mark.requirement("B-28", "B-30")
 def test_any_depth_image_gives_points_in_range_or_a_named_refusal(depth, dw: int, dh: int, median: int) -> None:
@@ -85,7 +85,7 @@ def test_any_pair_of_images_gives_finite_objects_or_named_refusals(data) -> None
         assert all(0.0 < edge < 1000.0 for edge in place.size[:2])
 
 
-@settings(max_examples=60)
+@settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1), st.floats(-0.06, 0.06), st.floats(0.0, 0.05))
 @pytest.mark.requirement("B-63")
 def test_the_table_is_measured_to_two_millimetres_with_things_on_it_or_refused(

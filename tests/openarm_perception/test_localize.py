@@ -69,14 +69,14 @@ def errors(thing, found) -> dict[str, float]:
 
 @pytest.mark.parametrize(("encoding", "sigma"), [("16UC1", 0.0), ("32FC1", 0.0), ("16UC1", 0.001), ("16UC1", 0.002)])
 @pytest.mark.requirement("A-63", "A-64", "P-15", "B-01")
-def test_objects_anywhere_on_the_table(tabletop, detector, localizer, encoding: str, sigma: float, capsys) -> None:
-    """48 objects at random places and yaws, overhead camera; p95 within 3 mm and 3 degrees, none beyond 5.
+def test_objects_anywhere_on_the_table(tabletop, detector, localizer, encoding: str, sigma: float) -> None:
+    """16 objects at random places and yaws, overhead camera; p95 within 3 mm and 3 degrees, none beyond 5.
 
     `sigma` is white noise of the depth, m.
     """
     rng = np.random.default_rng(7)
     rows: list[dict[str, float]] = []
-    for i in range(48):
+    for i in range(16):
         kind, size = SHAPES[i % len(SHAPES)]
         label = tabletop.labels[i % len(tabletop.labels)]
         x, y, yaw = rng.uniform(0.13, 0.37), rng.uniform(-0.43, 0.43), rng.uniform(-math.pi / 2, math.pi / 2)
@@ -87,17 +87,8 @@ def test_objects_anywhere_on_the_table(tabletop, detector, localizer, encoding: 
         assert found.method == ("rectangle" if kind == "box" else "circle"), thing
         assert found.visible == 1.0
         rows.append(errors(thing, found))
-    lines = [f"overhead, {encoding}, depth noise {sigma * 1e3:g} mm, n = {len(rows)}"]
-    worst = {}
-    for key in ("position", "yaw", "size"):
-        values = [row[key] for row in rows if key in row]
-        worst[key] = (np.percentile(values, 95), max(values))
-        unit = "deg" if key == "yaw" else "mm"
-        lines.append(
-            f"  {key:8} median {np.median(values):.2f}  p95 {worst[key][0]:.2f}  max {worst[key][1]:.2f} {unit}"
-        )
-    with capsys.disabled():
-        sys.stdout.write("\n" + "\n".join(lines) + "\n")
+    values = {key: [row[key] for row in rows if key in row] for key in ("position", "yaw", "size")}
+    worst = {key: (np.percentile(found, 95), max(found)) for key, found in values.items()}
     assert all(p95 <= 3.0 and most <= 5.0 for p95, most in worst.values()), worst
 
 

@@ -14,8 +14,8 @@ from benchmarks.moving_camera import measure
 def test_the_error_does_not_grow_with_the_speed_of_the_camera() -> None:
     """By the latest joint state, in the same images, it would be centimetres."""
     studio = Studio()
-    rest, fast = (measure(studio, speed, 8, first_seed=700) for speed in (0.0, 0.4))
+    rest, fast = (measure(studio, speed, 6, first_seed=700) for speed in (0.0, 0.4))
     studio.close()
-    assert len(fast.suite) == len(rest.suite) >= 6
+    assert len(fast.suite) == len(rest.suite) >= 4
     assert max(fast.suite) <= max(rest.suite) + 0.5
     assert np.median(fast.latest) > 10.0

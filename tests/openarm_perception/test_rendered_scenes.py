@@ -6,7 +6,6 @@ Seeds 0 to 19 are those of the reported campaigns; nothing here is tuned on them
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -28,10 +27,11 @@ def studio() -> Iterator[Studio]:
 
 
 @pytest.mark.requirement("A-26", "A-34", "A-60", "A-63", "A-64", "B-01")
-def test_every_object_of_random_scenes(studio, capsys) -> None:
-    """Overhead camera, robot at home, 16 scenes: every object and nothing else, right in place, size and yaw."""
+@pytest.mark.parametrize("scenes", [6, pytest.param(16, marks=pytest.mark.long)])
+def test_every_object_of_random_scenes(studio, scenes: int) -> None:
+    """Overhead camera, robot at home: every object and nothing else, right in place, size and yaw."""
     found = []
-    for seed in range(100, 116):
+    for seed in range(100, 100 + scenes):
         scene = random_scene(seed)
         perceived = studio.perceive(scene, studio.home(), "overhead")
         items = {item.label: item for item in scene.objects}
@@ -41,12 +41,7 @@ def test_every_object_of_random_scenes(studio, capsys) -> None:
             assert place.score > 0.8
             assert place.method == ("circle" if items[place.label].shape == "cylinder" else "rectangle")
             found.append(errors(place, items[place.label], scene.table))
-    median, p95, worst = (np.array(f) for f in (np.median(found, 0), np.percentile(found, 95, 0), np.max(found, 0)))
-    with capsys.disabled():
-        rows = zip(("position mm", "size mm", "yaw deg"), median, p95, worst, strict=True)
-        lines = [f"  {name:11} median {a:.2f}  p95 {b:.2f}  max {c:.2f}" for name, a, b, c in rows]
-        title = f"16 random scenes, overhead, 16UC1, {len(found)} objects"
-        sys.stdout.write("\n" + "\n".join([title, *lines]) + "\n")
+    p95, worst = np.percentile(found, 95, axis=0), np.max(found, axis=0)
     assert (p95 <= 3.0).all()
     assert (worst <= 5.0).all()
 
@@ -56,7 +51,7 @@ def test_the_wrist_camera_locates_or_refuses_by_name(studio) -> None:
     """Objects that fingers hide or the border cuts are refused; what is located is right."""
     joints = studio.looking()
     located = 0
-    for seed in range(100, 112):
+    for seed in range(100, 106):
         scene = random_scene(seed)
         items = {item.label: item for item in scene.objects}
         perceived = studio.perceive(scene, joints, "wrist")
@@ -65,7 +60,7 @@ def test_the_wrist_camera_locates_or_refuses_by_name(studio) -> None:
         for place in perceived.located:
             assert max(errors(place, items[place.label], scene.table)) < 3.0, (seed, place.label)
             located += 1
-    assert located >= 5
+    assert located >= 3
 
 
 @pytest.mark.parametrize("camera", ["overhead", "wrist"])
@@ -73,7 +68,7 @@ def test_the_wrist_camera_locates_or_refuses_by_name(studio) -> None:
 def test_depth_as_noisy_as_a_d435s_moves_nothing_by_a_millimetre(studio, camera: str) -> None:
     """Errors that grow with the square of the depth, flying pixels at every edge, holes."""
     found, seed = [], 120
-    while len(found) < 12:
+    while len(found) < 6:
         scene, rng = random_scene(seed, count=1), np.random.default_rng(seed)
         joints = studio.looking(rng) if camera == "wrist" else studio.home()
         seed += 1
@@ -93,7 +88,7 @@ def test_nothing_is_seen_on_robot_and_table(studio) -> None:
     scene = load_scene("empty")
     names = [name for side in SIDES for name in studio.description.arm_joints(side)]
     lower, upper = studio.description.limits(names)
-    for _ in range(6):
+    for _ in range(3):
         joints = studio.home() | dict(zip(names, rng.uniform(lower, upper), strict=True))
         for camera in ("overhead", "wrist"):
             studio.load(scene, joints)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -62,38 +63,54 @@ VERTICES = np.array([(0, 0, 0), (0.03, 0, 0), (0, 0.02, 0), (0, 0, 0.1), (0.01, 
 TRIANGLES = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 4), (2, 3, 4), (3, 1, 4)])
 
 
-@pytest.fixture
-def mjcf(tmp_path: Path) -> Path:
-    write_stl(tmp_path / "part.stl", VERTICES, TRIANGLES)
+def write_mjcf(folder: Path) -> Path:
+    write_stl(folder / "part.stl", VERTICES, TRIANGLES)
     left = ARM.format(side="left", y=0.2, roll=0.3, axis=1)
     right = ARM.format(side="right", y=-0.2, roll=-0.3, axis=-1)
-    path = tmp_path / "two.xml"
+    path = folder / "two.xml"
     path.write_text(MJCF.format(left=left, right=right), encoding="utf-8")
     return path
 
 
 @pytest.fixture
-def folder(mjcf: Path, tmp_path: Path) -> Path:
-    edits = tmp_path / "edits.yaml"
+def mjcf(tmp_path: Path) -> Path:
+    return write_mjcf(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the draft, which tests copy."""
+    source = tmp_path_factory.mktemp("draft")
+    edits = source / "edits.yaml"
     edits.write_text(yaml.safe_dump(EDITS))
-    out = tmp_path / "robots" / "two"
+    out = source / "robots" / "two"
     out.mkdir(parents=True)
     postures = {"home": {"right": [0.1, 0.05], "left": "mirrored"}}
-    source = {"postures": postures, "gripper": {"open": 0.3}, "samples": 100, "may_touch": [["{arm}_f1", "{arm}_f2"]]}
-    (out / "semantics.yaml").write_text(yaml.safe_dump(source))
-    draft_folder(out, mjcf, ARMS, edits)
+    semantics = {
+        "postures": postures,
+        "gripper": {"open": 0.3},
+        "samples": 100,
+        "may_touch": [["{arm}_f1", "{arm}_f2"]],
+    }
+    (out / "semantics.yaml").write_text(yaml.safe_dump(semantics))
+    draft_folder(out, write_mjcf(source), ARMS, edits)
     return out
 
 
+@pytest.fixture
+def folder(two: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(two, tmp_path / "robots" / "two")
+
+
 def assert_same_motion(model: mujoco.MjModel, urdf: str, tolerance: float = 1e-9) -> None:
-    """Places of links, and torques of gravity, Coriolis and inertia, in 30 random states."""
+    """Places of links, and torques of gravity, Coriolis and inertia, in 10 random states."""
     robot, data = pin.buildModelFromXML(urdf), mujoco.MjData(model)
     found, rng = robot.createData(), np.random.default_rng(0)
     followers = {j.name: j for j in RobotDescription.from_urdf(urdf).joints.values() if j.mimic is not None}
     joints = [model.joint(k) for k in range(model.njnt)]
     at = {joint.name: robot.joints[robot.getJointId(joint.name)].idx_q for joint in joints}
     assert robot.nv == model.nv == len(at)
-    for _ in range(30):
+    for _ in range(10):
         value = {j.name: rng.uniform(*j.range) for j in joints}
         value |= {n: f.multiplier * value[str(f.mimic)] + f.offset for n, f in followers.items()}
         speed = rng.normal(size=model.nv)
@@ -249,7 +266,7 @@ def test_a_draft_of_a_urdf_brings_its_meshes_and_names_its_shapes(folder, tmp_pa
     text = (folder / "two.urdf").read_text().replace(' name="foot_block_collision"', "")
     (folder / "two.urdf").write_text(text)
     (tmp_path / "more").mkdir()
-    draft_folder(tmp_path / "more" / "again", folder / "two.urdf", {"left": ("foot", "left_tcp")})
+    draft_folder(tmp_path / "more" / "again", folder / "two.urdf", {"left": ("foot", "left_tcp")}, samples=100)
     again = RobotDescription.from_files(tmp_path / "more" / "again" / "again.urdf")
     assert [s.name for s in again.links["foot"].collision] == ["foot_00_collision"]
     assert f"{tmp_path}/more/again/meshes/collision/part_hull.stl" in again.urdf

@@ -20,7 +20,10 @@ BOARD = CircleGrid()
 
 
 class PosedRobot:
-    """Joint states at 100 Hz and images at 20 Hz of a time of its own; poses of a session with a known mount."""
+    """Joint states at 100 Hz and images at 20 Hz of a time of its own; poses of a session with a known mount.
+
+    Its time runs 2.5 times as fast as the wall clock.
+    """
 
     def __init__(self, ros, camera: str, known: Known) -> None:
         self.known, self.camera = known, camera
@@ -39,7 +42,7 @@ class PosedRobot:
         self._joints = node.create_publisher(JointState, "/joint_states", QOS_COMMAND)
         self._image = node.create_publisher(Image, f"/{camera}/color/image_raw", QOS_SENSOR)
         self._info = node.create_publisher(CameraInfo, f"/{camera}/color/camera_info", QOS_SENSOR)
-        node.create_timer(0.01, self._tick)
+        node.create_timer(0.02, self._tick)
 
     def pose(self, k: int) -> None:
         """Stand as in sample k, and let the camera see that."""
@@ -56,12 +59,13 @@ class PosedRobot:
         self._pixels = np.repeat(grey[:, :, None], 3, axis=2).astype(np.uint8)
 
     def _tick(self) -> None:
-        self._t += 10 * MS
-        message = JointState(name=list(self.joints), position=list(self.joints.values()))
-        message.position[0] += self.speed * (self._t - 10_000 * MS) * 1e-9
-        message.header.stamp = ns_to_stamp(self._t)
-        self._joints.publish(message)
-        if self.images and self._t % (50 * MS) == 0:
+        for _ in range(5):
+            self._t += 10 * MS
+            message = JointState(name=list(self.joints), position=list(self.joints.values()))
+            message.position[0] += self.speed * (self._t - 10_000 * MS) * 1e-9
+            message.header.stamp = ns_to_stamp(self._t)
+            self._joints.publish(message)
+        if self.images:
             frame = f"{self.camera}_color_optical_frame"
             t = self._t + self.offset_ns
             pixels = np.full_like(self._pixels, 128) if self.blank else self._pixels

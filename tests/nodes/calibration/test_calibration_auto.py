@@ -27,7 +27,7 @@ from openarm_common.scene.scene import load_scene
 from tests.openarm_calibration.known_session import Known, make_session
 
 QUICK = {
-    "auto.search.draws": 500, "auto.search.candidates": 12, "auto.tries": 10, "auto.settle_timeout": 10.0,
+    "auto.search.draws": 250, "auto.search.candidates": 12, "auto.tries": 10, "auto.settle_timeout": 10.0,
     "image_timeout": 20.0, "state_timeout": 20.0,
 }  # fmt: skip
 
@@ -102,7 +102,9 @@ class Bench:
         return mount_error(pose_to_matrix(result.mount), self.known.X @ se3.inverse(T_LINK_OPTICAL))
 
 
-@pytest.mark.parametrize(("setup", "given_pose"), [("in_hand", True), ("to_hand", False)])
+@pytest.mark.parametrize(
+    ("setup", "given_pose"), [("in_hand", True), pytest.param("to_hand", False, marks=pytest.mark.long)]
+)
 @pytest.mark.requirement("A-33", "A-34", "A-40", "A-45")
 def test_calibrates_by_itself_and_stores(ros, posed_robot, tmp_path: Path, setup: str, given_pose: bool) -> None:
     """From a board in view, or from where a ruler says it is; refused poses are passed over; the board is announced."""

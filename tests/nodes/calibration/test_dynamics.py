@@ -7,19 +7,26 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from openarm_interfaces.action import MoveArm
+from rclpy.parameter import Parameter
 
-from openarm_bringup.calibration.ros.dynamics import pieces
+from openarm_bringup.calibration.ros import dynamics as ros_dynamics
+from openarm_bringup.calibration.ros.dynamics import DynamicsClient, pieces
 from openarm_bringup.commands.calibrate_live import dynamics
 from openarm_bringup.outcome import Outcome
+from openarm_calibration.dynamics import excite
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder
-from openarm_common.robot.servo_store import ServoStore
-from openarm_common.ros.convert import ns_to_stamp
+from openarm_common.robot.servo_store import ServoStore, StoredServos
+from openarm_common.robot.servos import ArmLoad
+from openarm_common.ros.convert import ns_to_stamp, trajectory_from_msg
 from openarm_sim_bridge.world.hardware import HardwareConfig, drawn
 
 NAMES = ("a", "b")
@@ -38,8 +45,78 @@ def identify(bench, **options) -> Outcome:
         return done.result()
 
 
-def test_servos_are_identified_stored_and_used(ros, bridge) -> None:
+def taken_over(bench, stored: StoredServos) -> None:
+    """Wait until the bridge carries the right arm by stored servos."""
+    servos, expected = bench.node._face._servos, f"identified {stored.digest()[:12]}"
+    bench.ros.spin_until(lambda: servos.sources["right"] == expected, what="the bridge to use them")
+    assert servos.sources["left"] == "as configured"
+
+
+class KnownArm(DynamicsClient):
+    """An arm with known servos that goes exactly where it is sent, in place of the graph; no plan leads to one posture.
+
+    Its servos are given the targets that they need for that.
+    """
+
+    STIFFNESS, DAMPING, FRICTION, LATENCY, PERIOD_S = np.linspace(60.0, 240.0, 7), 3.0, 0.4, 0.02, 0.01
+    PARAMETERS: ClassVar = {"profile": "openarm", "openarm.dynamics_seed": 7, "controller": "/{arm}_controller/follow"}
+
+    def _sources(self) -> set[str]:
+        return {"mujoco_bridge"}
+
+    def call(self, kind, name: str, request, timeout: float = 0.0):
+        return kind.Response(
+            values=[Parameter(n, value=self.PARAMETERS[n]).get_parameter_value() for n in request.names]
+        )
+
+    def do(self, kind, name: str, goal, **_):
+        if kind is MoveArm:
+            assert goal.arm == "right"
+            self.at = list(goal.joint_positions)
+            refused, self.refused = not getattr(self, "refused", False), True
+            return MoveArm.Result(success=not refused, code="NO_PLAN" if refused else "OK")
+        assert name == "/right_controller/follow"
+        assert {one.position for one in [*goal.path_tolerance, *goal.goal_tolerance]} == {-1.0}
+        (subscription,) = (
+            one for one in self._node.subscriptions if one.topic_name == "/right_controller/controller_state"
+        )
+        names, t, q, _, _ = trajectory_from_msg(goal.trajectory)
+        assert q[0] == pytest.approx(self.at)
+        load = ArmLoad(self._description, names, self._description.tcp_link("right"))
+        position = np.stack([np.interp(np.arange(0.0, t[-1], self.PERIOD_S), t, column) for column in q.T], axis=1)
+        window = np.hanning(9) / np.hanning(9).sum()
+        position = np.apply_along_axis(np.convolve, 0, np.pad(position, ((4, 4), (0, 0)), mode="edge"), window, "valid")
+        velocity = np.gradient(position, self.PERIOD_S, axis=0)
+        states = zip(position, velocity, np.gradient(velocity, self.PERIOD_S, axis=0), strict=True)
+        torque = np.array([load.torque(*one) for one in states]) + self.DAMPING * velocity
+        target = position + (torque + self.FRICTION * np.sign(velocity)) / self.STIFFNESS
+        for k, late in enumerate(target[round(self.LATENCY / self.PERIOD_S) :]):
+            message = JointTrajectoryControllerState(joint_names=names)
+            message.header.stamp = ns_to_stamp(round(k * self.PERIOD_S * 1e9))
+            message.feedback.positions, message.output.positions = position[k].tolist(), late.tolist()
+            subscription.callback(message)
+        return FollowJointTrajectory.Result(error_code=FollowJointTrajectory.Result.SUCCESSFUL)
+
+
+def test_known_servos_are_identified_stored_and_used(bridge, monkeypatch) -> None:
+    monkeypatch.setattr(excite, "_CYCLES", 4)
+    monkeypatch.setattr(ros_dynamics, "DynamicsClient", KnownArm)
     bench = bridge(images=False, profile="openarm", openarm__dynamics_seed=7)
+    done = dynamics(domain=int(os.environ["ROS_DOMAIN_ID"]), arm="right", postures=3)
+    assert done.success, done.message
+    assert "joint  gain, N m/rad" in done.text
+    stored = ServoStore(default_folder()).load("right")
+    assert stored.dynamics_seed == 7
+    np.testing.assert_allclose(stored.stiffness, KnownArm.STIFFNESS, rtol=0.15)
+    np.testing.assert_allclose(stored.friction, KnownArm.FRICTION, atol=0.25)
+    np.testing.assert_allclose(stored.damping, KnownArm.DAMPING, rtol=0.3)
+    np.testing.assert_allclose(stored.latency, KnownArm.LATENCY, atol=0.008)
+    taken_over(bench, stored)
+
+
+@pytest.mark.long
+def test_servos_are_identified_stored_and_used(ros, bridge) -> None:
+    bench = bridge(images=False, profile="openarm", openarm__dynamics_seed=7, speed=1.0)
     said = bench.collect(DiagnosticArray, "/diagnostics", 10)
     # signs of life are not exchanged within a process
     motion = subprocess.Popen([sys.executable, "-m", "openarm_motion.ros.node"])
@@ -57,11 +134,7 @@ def test_servos_are_identified_stored_and_used(ros, bridge) -> None:
     made, names = drawn(HardwareConfig(dynamics_seed=7), bench.node.description), bench.ARM
     np.testing.assert_allclose(stored.stiffness, [made.stiffness[name] for name in names], rtol=0.15)
     np.testing.assert_allclose(stored.friction, [made.friction[name] for name in names], atol=0.25)
-    ros.spin_until(
-        lambda: bench.node._face._servos.sources["right"] == f"identified {stored.digest()[:12]}",
-        what="the bridge to use them",
-    )
-    assert bench.node._face._servos.sources["left"] == "as configured"
+    taken_over(bench, stored)
 
 
 def test_ideal_servos_are_not_identified(bench) -> None:

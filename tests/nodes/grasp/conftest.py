@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The grasp node in process, between a robot, a planner and a detector that are fakes of this file.
 
-The fakes speak the real interfaces. Robot time runs five times as fast as the wall clock.
+The fakes speak the real interfaces. Robot time runs ten times as fast as the wall clock.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -23,7 +25,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
-from scipy.optimize import least_squares
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithPose
@@ -33,13 +34,17 @@ from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, pose_to_matrix, vector
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, reliable
+from openarm_grasp.ros.client import GraspClient
 from openarm_grasp.ros.node import GraspNode
+from openarm_motion.kinematics.chain import ArmKinematics
 
 BASE_FRAME = RobotDescription.load().base
 
+Result = TypeVar("Result")
+
 ARMS = ("left", "right")
 CUBE = 0.05
-STEP_S, STEP_NS = 0.01, 50_000_000
+STEP_S, STEP_NS = 0.01, 100_000_000
 OPEN = 0.044
 
 
@@ -66,6 +71,7 @@ class FakeGraph(Node):
         self._group = ReentrantCallbackGroup()
         self._servers: list[ActionServer] = []
         self.robot = RobotDescription.load()
+        self.kinematics = {arm: ArmKinematics(self.robot, self.robot.tcp_link(arm)) for arm in ARMS}
         self.t_ns, self.step_ns = 5_000_000_000, STEP_NS
         self.silent = self.blind = False
         self.slips, self.scene = 0, 1
@@ -165,15 +171,8 @@ class FakeGraph(Node):
         return result
 
     def _reach(self, arm: str, p: np.ndarray, q0: np.ndarray | None = None) -> np.ndarray:
-        names = self.robot.arm_joints(arm)
-        lower, upper = self.robot.limits(names)
-        start = q0 if q0 is not None else np.array([self.q[n] for n in names])
-        link = self.robot.tcp_link(arm)
-
-        def error(q):
-            return self.robot.link_pose(link, dict(zip(names, q, strict=True)))[:3, 3] - p
-
-        return least_squares(error, np.clip(start, lower + 0.01, upper - 0.01), bounds=(lower, upper)).x
+        start = q0 if q0 is not None else [self.q[n] for n in self.robot.arm_joints(arm)]
+        return self.kinematics[arm].ik(se3.make(p=p), start, position_only=True, restarts=0).q
 
     def _trajectory(self, arm: str, start: np.ndarray, end: np.ndarray) -> JointTrajectory:
         points = [JointTrajectoryPoint(positions=(start + u * (end - start)).tolist()) for u in (0.0, 0.5, 1.0)]
@@ -277,8 +276,7 @@ class Bench:
     def __init__(self, ros, **fakes: bool) -> None:
         self.ros = ros
         self.world: FakeGraph = ros.add(FakeGraph(**fakes))
-        complete = fakes.get("motion", True) and fakes.get("detector", True)
-        patience = Parameter("limits.ready_timeout", value=60.0 if complete else 5.0)
+        patience = Parameter("limits.ready_timeout", value=60.0)
         self.node: GraspNode = ros.add(GraspNode(parameter_overrides=[patience]))
         self.status: list[GraspStatus] = []
         self.markers: list[MarkerArray] = []
@@ -303,6 +301,22 @@ class Bench:
 
     def until(self, condition: Callable[[], object], *, what: str = "") -> None:
         self.ros.spin_until(condition, 60.0, what)
+
+    def in_thread(self, work: Callable[[], Result]) -> Result:
+        """What blocks elsewhere, while the nodes are spun here."""
+        with ThreadPoolExecutor(1) as worker:
+            done = worker.submit(work)
+            self.until(done.done, what="the thread ends")
+            return done.result()
+
+    def program(self, work: Callable[[GraspClient], Result]) -> Result:
+        """What a program does with the client."""
+
+        def run() -> Result:
+            with GraspClient() as grasp:
+                return work(grasp)
+
+        return self.in_thread(run)
 
 
 def silence(message: str) -> float:

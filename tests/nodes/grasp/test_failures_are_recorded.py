@@ -7,7 +7,8 @@ import pytest
 from openarm_interfaces.action import PickTwo
 from openarm_interfaces.msg import PickRequest
 from openarm_interfaces.srv import Grasp, SaveRecording
-from rclpy.action import ActionClient
+
+from tests.nodes.grasp.conftest import OPEN
 
 pytestmark = pytest.mark.requirement("R-24", "N-24")
 
@@ -28,16 +29,27 @@ def asked(bench) -> list[str]:
     return reasons
 
 
-def test_a_failure_is_recorded_with_its_reason_and_the_command_for_another_try(bench, asked) -> None:
+@pytest.mark.requirement("A-71", "N-19")
+def test_an_empty_hand_is_tried_again_and_recorded_with_its_reason_and_the_command_for_another_try(
+    bench, asked
+) -> None:
     bench.world.slips = 99
     request = Grasp.Request(label="red", arm="right", has_place_position=True)
     request.place_position.x, request.place_position.y = 0.25, -0.3
     answer = bench.ros.call(bench.service, request)
-    assert (answer.code, answer.recording) == ("GRASP_MISSED", "/recordings/1")
+    assert (answer.code, answer.attempts, answer.recording) == ("GRASP_MISSED", 3, "/recordings/1")
+    assert "closed on nothing" in answer.message
     reason, about, again = asked[0].splitlines()
     assert reason == f"GRASP_MISSED: {answer.message}"
     assert "label='red'" in about
     assert again == "again: openarm pick red --arm right --place 0.25 -0.3 0.0"
+    bench.until(lambda: any(one.code for one in bench.status), what="the status of the end")
+    assert {(one.state, one.code) for one in bench.status if one.code} == {("IDLE", "GRASP_MISSED")}
+    assert {one.budget for one in bench.status if one.state == "PLAN"} == {5.0}
+    assert sum(one.duration for one in answer.state_times) == pytest.approx(answer.duration, abs=0.05)
+    assert {one.state for one in answer.state_times} >= {"DETECT", "CLOSE_GRIPPER", "RESET"}
+    assert bench.world.q[bench.world.robot.finger_joint("right")] == OPEN
+    assert bench.world.log[-1] == "move home"
 
 
 def test_a_refusal_is_recorded_and_what_is_not_the_robots_fault_is_not(bench, asked) -> None:
@@ -49,14 +61,20 @@ def test_a_refusal_is_recorded_and_what_is_not_the_robots_fault_is_not(bench, as
     assert len(asked) == 1
 
 
-def test_of_two_requests_there_is_one_recording(bench, asked) -> None:
-    goal = PickTwo.Goal(requests=[PickRequest(label="mug"), PickRequest(label="red")])
-    _, result = bench.ros.send_goal(ActionClient(bench.ros.node, PickTwo, "/grasp/pick_two"), goal)
+@pytest.mark.requirement("P-02")
+def test_one_of_two_that_is_not_in_view_is_refused_and_the_other_placed_and_there_is_one_recording(
+    bench, asked
+) -> None:
+    goal = PickTwo.Goal(requests=[PickRequest(label="mug"), PickRequest(label="blue")])
+    _, result = bench.ros.send_goal(bench.two, goal)
     answer = bench.ros.result(result, 60.0).result
-    assert not answer.success
+    assert (answer.success, answer.outcome, answer.code) == (False, "PARTIAL", "UNKNOWN_OBJECT")
+    assert [one.outcome for one in answer.results] == ["REFUSED", "SUCCESS"]
+    assert "no 'mug' in view" in answer.message
     assert answer.recording == "/recordings/1"
-    assert asked[0].splitlines()[2] == "again: openarm pick mug red --arm auto --arm auto"
+    assert asked[0].splitlines()[2] == "again: openarm pick mug blue --arm auto --arm auto"
     assert len(asked) == 1
+    assert bench.ask("", phase="place").code == "NOT_READY"
 
 
 def test_a_recorder_that_does_not_answer_keeps_no_answer_back(bench) -> None:

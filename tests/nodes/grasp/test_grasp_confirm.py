@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-from threading import Thread
-
 import pytest
 from openarm_interfaces.action import Pick
 from openarm_interfaces.msg import GraspStatus
 from openarm_interfaces.srv import Grasp
 
 from openarm_common.errors import Code
-from openarm_grasp.ros.client import GraspClient
+from openarm_grasp.ros.client import GraspClient, GraspResult
 
 pytestmark = pytest.mark.requirement("P-20", "R-25")
 
@@ -109,18 +107,12 @@ def test_a_plan_that_does_not_hold_any_more_is_replaced_by_one_that_is_asked_abo
 
 def test_the_client_asks_its_caller(bench):
     asked: list[GraspStatus] = []
-    results = []
 
-    def script() -> None:
-        with GraspClient() as grasp:
-            results.append(grasp.pick("red", confirm=lambda plan: bool(asked.append(plan))))
-            results.append(grasp.pick("blue", confirm=lambda plan: asked.append(plan) is None))
+    def work(grasp: GraspClient) -> list[GraspResult]:
+        rejected = grasp.pick("red", confirm=lambda plan: bool(asked.append(plan)))
+        return [rejected, grasp.pick("blue", confirm=lambda plan: asked.append(plan) is None)]
 
-    thread = Thread(target=script)
-    thread.start()
-    bench.until(lambda: not thread.is_alive(), what="the script ends")
-    thread.join()
-    rejected, placed = results
+    rejected, placed = bench.program(work)
     assert (rejected.code, rejected.attempts) == (Code.CANCELLED, 0)
     assert placed.success, placed.message
     assert [(plan.label, plan.arm) for plan in asked] == [("red", "right"), ("blue", "left")]

@@ -37,8 +37,9 @@ from tests.conftest import own_domain
 
 Result = FollowJointTrajectory.Result
 HZ = 100
-#: The fake robot's time runs this much faster than the wall clock.
-FASTER = 4
+#: The fake robot's time runs this much faster than the wall clock; and while something is planned or disturbed on its
+#: way, where a slow machine must be in time, too.
+FASTER, SLOWER = 4.0, 0.5
 
 
 class FakeRobot:
@@ -48,7 +49,7 @@ class FakeRobot:
         self.node, self.state = node, dict(state)
         self.t_ns = 1_000_000_000
         #: Seconds of its time per second of the wall clock.
-        self.speed = float(FASTER)
+        self.speed = FASTER
         self.silent = False
         self.answer: Callable[[FollowJointTrajectory.Result], None] = lambda result: None
         self.stuck: set[str] = set()
@@ -176,9 +177,14 @@ class Bench:
         """Send a trajectory and wait until the arm is on its way."""
         goal = ExecuteTrajectory.Goal(arm=side, trajectory=trajectory)
         handle, future = self.start(self.execute_client, goal)
-        self.ros.spin_until(lambda: side in self.robot.active or future.done(), what="the arm to start")
+        self.under_way(side)
         assert not future.done(), future.result()
+        self.robot.speed = SLOWER
         return handle, future
+
+    def under_way(self, side: str) -> None:
+        """Wait until a controller has a trajectory."""
+        self.ros.spin_until(lambda: side in self.robot.active, what=f"the {side} arm to be commanded")
 
     @staticmethod
     def stamped(T: np.ndarray, frame: str = "") -> PoseStamped:
@@ -193,10 +199,8 @@ class Bench:
         return MoveArm.Goal(arm=arm, kind=MoveArm.Goal.NAMED, named=posture, velocity_scale=1.0, **kwargs)
 
     def slow_plan(self, side: str = "right") -> JointTrajectory:
-        """A motion that takes long enough to be disturbed: 40 s of the robot's time."""
-        goal = self.named(side, plan_only=True)
-        goal.velocity_scale = 0.02
-        return self.run(self.move_client, goal).trajectory
+        """A motion that takes long enough to be disturbed."""
+        return slower(self.run(self.move_client, self.named(side, plan_only=True)).trajectory)
 
     def q(self, side: str) -> np.ndarray:
         return np.array([self.robot.state[name] for name in self.description.arm_joints(side)])
@@ -208,6 +212,16 @@ class Bench:
         return [marker.ns for marker in self.markers[-1].markers if marker.action == Marker.ADD]
 
 
+def slower(trajectory: JointTrajectory, factor: int = 8) -> JointTrajectory:
+    """Stretch a trajectory in time."""
+    for point in trajectory.points:
+        ns = factor * (point.time_from_start.sec * 10**9 + point.time_from_start.nanosec)
+        point.time_from_start.sec, point.time_from_start.nanosec = divmod(ns, 10**9)
+        point.velocities = [v / factor for v in point.velocities]
+        point.accelerations = [a / factor**2 for a in point.accelerations]
+    return trajectory
+
+
 class RobotNode(BaseNode):
     """A node whose callbacks overlap, as the bridge's do."""
 
@@ -217,7 +231,7 @@ class RobotNode(BaseNode):
 
 @pytest.fixture
 def ros_domain() -> Iterator[int]:
-    """A domain for each test: action servers that a test leaves behind count as there in their participant."""
+    """A domain for each test: clients and servers of actions stay in their participant, and each slows discovery."""
     with own_domain() as domain:
         yield domain
 

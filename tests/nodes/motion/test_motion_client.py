@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -19,22 +19,15 @@ from openarm_motion.ros.client import MotionClient
 
 def asked(bench, work: Callable[[MotionClient], Any]) -> Any:
     """What a program does with the client, while the graph spins here."""
-    out: list[Any] = []
-    faults: list[BaseException] = []
 
-    def run() -> None:
-        try:
-            with MotionClient() as motion:
-                out.append(work(motion))
-        except BaseException as error:
-            faults.append(error)
+    def run() -> Any:
+        with MotionClient() as motion:
+            return work(motion)
 
-    thread = threading.Thread(target=run)
-    thread.start()
-    bench.ros.spin_until(lambda: not thread.is_alive(), 40.0, "the program")
-    if faults:
-        raise faults[0]
-    return out[0]
+    with ThreadPoolExecutor(1) as worker:
+        done = worker.submit(run)
+        bench.ros.spin_until(done.done, 40.0, "the program")
+        return done.result()
 
 
 def test_a_program_plans_agrees_and_moves(bench) -> None:

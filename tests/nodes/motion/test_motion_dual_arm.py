@@ -11,6 +11,7 @@ from openarm_interfaces.msg import ArmTarget, CollisionBox
 from openarm_common import se3
 from openarm_common.ros.convert import matrix_to_pose, stamp_to_ns
 from openarm_motion.planning.dual_arm import DualArm
+from tests.nodes.motion.conftest import SLOWER
 
 
 def over_the_middle(bench, arm: str, **kwargs) -> ArmTarget:
@@ -38,7 +39,9 @@ def watched(bench, goal: MoveArms.Goal) -> tuple[MoveArms.Result, float]:
     return future.result().result, min(scene.separation(q) for q in configurations)
 
 
-@pytest.mark.parametrize("strategy", [MoveArms.Goal.TOGETHER, MoveArms.Goal.STAGGERED])
+@pytest.mark.parametrize(
+    "strategy", [pytest.param(MoveArms.Goal.TOGETHER, marks=pytest.mark.long), MoveArms.Goal.STAGGERED]
+)
 @pytest.mark.requirement("N-12")
 def test_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
     result, _ = watched(bench, both_goal(over_the_middle(bench, "left"), home("right"), strategy=strategy))
@@ -56,7 +59,7 @@ def test_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
 
 
 @pytest.mark.requirement("A-74")
-def test_an_arm_in_the_way_yields(bench) -> None:
+def test_an_arm_in_the_way_yields_and_another_stays(bench) -> None:
     result, _ = watched(bench, both_goal(over_the_middle(bench, "left"), home("right")))
     assert result.success, result.message
     blocked = bench.run(
@@ -70,19 +73,15 @@ def test_an_arm_in_the_way_yields(bench) -> None:
     assert gap >= 0.020
     state = bench.description.group_state("left_arm", "home")
     np.testing.assert_allclose(bench.q("left"), [state[n] for n in bench.description.arm_joints("left")], atol=2e-3)
+    target = ArmTarget(arm="right", kind=ArmTarget.NAMED, named="official_home")
+    before = bench.q("left")
+    result, _ = watched(bench, both_goal(target, yielding))
+    assert result.success, result.message
+    np.testing.assert_allclose(bench.q("left"), before, atol=1e-6)
 
 
 def stay(bench, arm: str) -> ArmTarget:
     return ArmTarget(arm=arm, kind=ArmTarget.JOINTS, joint_positions=bench.q(arm).tolist())
-
-
-def test_an_arm_that_is_not_in_the_way_stays(bench) -> None:
-    before = bench.q("left")
-    yielding = ArmTarget(arm="left", kind=ArmTarget.YIELD)
-    target = ArmTarget(arm="right", kind=ArmTarget.NAMED, named="official_home")
-    result, _ = watched(bench, both_goal(target, yielding))
-    assert result.success, result.message
-    np.testing.assert_allclose(bench.q("left"), before, atol=1e-6)
 
 
 def test_when_one_arm_fails_the_other_holds(bench) -> None:
@@ -100,7 +99,7 @@ def test_when_one_arm_fails_the_other_holds(bench) -> None:
 
 def test_cancel_holds_both(bench) -> None:
     goal = both_goal(*[ArmTarget(arm=arm, kind=ArmTarget.NAMED, named="official_home") for arm in ("left", "right")])
-    goal.velocity_scale = 0.05
+    goal.velocity_scale, bench.robot.speed = 0.1, SLOWER
     handle, future = bench.start(bench.both_client, goal)
     bench.ros.spin_until(lambda: len(bench.robot.active) == 2, what="both arms on their way")
     busy = bench.run(bench.move_client, bench.named("left"))

@@ -19,7 +19,7 @@ from openarm_common.ros.convert import (
     trajectory_from_msg,
     trajectory_to_msg,
 )
-from tests.nodes.motion.conftest import FASTER
+from tests.nodes.motion.conftest import SLOWER
 
 
 # --- execution
@@ -43,10 +43,7 @@ def test_a_bad_trajectory_is_refused_with_joint_and_value(bench) -> None:
 
 
 def test_cancel_holds(bench) -> None:
-    handle, future = bench.start(
-        bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=bench.slow_plan())
-    )
-    bench.ros.spin_until(lambda: "right" in bench.robot.active, what="the arm to start")
+    handle, future = bench.begin("right", bench.slow_plan())
     bench.ros.result(handle.cancel_goal_async())
     answer = bench.ros.result(future)
     assert answer.status == 5  # canceled
@@ -101,7 +98,7 @@ def test_a_silent_robot_ends_a_motion_within_two_seconds(bench) -> None:
     bench.robot.silent = True
     begin_ns = bench.robot.t_ns
     result = bench.ros.result(future).result
-    assert bench.robot.t_ns - begin_ns < 2e9 * FASTER  # a clock of this executor: a halt of the machine does not count
+    assert bench.robot.t_ns - begin_ns < 2e9 * SLOWER  # a clock of this executor: a halt of the machine does not count
     assert (result.success, result.code) == (False, "ROBOT_LOST")
     assert "no /joint_states" in result.message
     # and nothing new is begun
@@ -117,10 +114,11 @@ def test_a_controller_that_vanishes_ends_a_motion_within_two_seconds(bench) -> N
     bench.robot.servers["right"].destroy()
     bench.robot.ignore_regions.add("right")
     result = bench.ros.result(future).result
-    assert bench.robot.t_ns - begin_ns < 2e9 * FASTER
+    assert bench.robot.t_ns - begin_ns < 2e9 * SLOWER
     assert (result.success, result.code) == (False, "ROBOT_LOST")
 
 
+@pytest.mark.long
 def test_stopping_the_motion_process_on_the_way_holds_the_arm(make_bench) -> None:
     bench = make_bench(motion=False)
     command = [sys.executable, "-m", "openarm_motion.ros.node"]

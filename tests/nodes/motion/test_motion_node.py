@@ -29,7 +29,7 @@ from tests.conftest import DEADLINE_S
 
 # --- inverse kinematics
 @pytest.mark.requirement("A-66")
-def test_compute_ik_in_the_table_frame(bench) -> None:
+def test_compute_ik_in_the_table_frame_or_what_is_wrong(bench) -> None:
     target = se3.make(bench.DOWN, (0.4, 0.2, 0.3))
     request = ComputeIK.Request(arm="left", pose=bench.stamped(target, "table"), position_only=True)
     answer = bench.ros.call(bench.ik_client, request)
@@ -48,9 +48,6 @@ def test_compute_ik_in_the_table_frame(bench) -> None:
     nearest = ", ".join(f"{getattr(answer.nearest.position, axis):.3f}" for axis in "xyz")
     assert f"{answer.position_error * 1e3:.0f} mm" in answer.message
     assert f"away, at ({nearest}) m" in answer.message
-
-
-def test_compute_ik_answers_what_is_wrong(bench) -> None:
     answer = bench.ros.call(bench.ik_client, ComputeIK.Request(arm="third", pose=bench.stamped(np.eye(4))))
     assert (answer.code, answer.message) == ("INVALID_ARGUMENT", "arm is 'third'; arms: left, right")
     answer = bench.ros.call(bench.ik_client, ComputeIK.Request(arm="left", pose=bench.stamped(np.eye(4), "nowhere")))
@@ -74,14 +71,6 @@ def test_a_move_is_planned_sent_as_joint_targets_and_verified(bench) -> None:
     assert len(result.trajectory.points[0].accelerations) == 7
     assert (feedback[0].stage, feedback[-1].stage) == ("planning", "executing")
     assert result.planning_time > 0.0
-
-
-def test_plan_only_moves_nothing(bench) -> None:
-    before = bench.q("right")
-    result = bench.run(bench.move_client, bench.named(plan_only=True))
-    assert result.success
-    assert len(result.trajectory.points) > 10
-    np.testing.assert_array_equal(bench.q("right"), before)
 
 
 def test_every_kind_of_move(bench) -> None:
@@ -254,8 +243,9 @@ def test_table_comes_from_the_scene_description() -> None:
 
 
 @pytest.mark.requirement("B-50")
-def test_obstacles_travel_with_the_request(bench) -> None:
+def test_obstacles_travel_with_the_request_and_a_plan_alone_moves_nothing(bench) -> None:
     # no planning scene that could lack them: the same goal is refused with the box and planned without it
+    before = bench.q("right")
     arm = bench.node.service.arms["right"]
     goal = bench.named("right", "official_home", plan_only=True)
     tip = arm.kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])
@@ -263,7 +253,10 @@ def test_obstacles_travel_with_the_request(bench) -> None:
     result = bench.run(bench.move_client, goal)
     assert result.code == "IN_COLLISION"
     assert "box" in result.message
-    assert bench.run(bench.move_client, bench.named("right", "official_home", plan_only=True)).success
+    result = bench.run(bench.move_client, bench.named("right", "official_home", plan_only=True))
+    assert result.success
+    assert len(result.trajectory.points) > 10
+    np.testing.assert_array_equal(bench.q("right"), before)
 
 
 class WaitingPlanner:
@@ -289,7 +282,7 @@ def waiting_planner(bench) -> WaitingPlanner:
     return arm._planner
 
 
-def test_a_search_ends_by_cancel(bench) -> None:
+def test_a_search_ends_by_cancel_and_with_the_node(bench) -> None:
     planner = waiting_planner(bench)
     for client, goal in ((bench.move_client, bench.named()), (bench.plan_client, approach_goal(bench))):
         planner.searching.clear()
@@ -299,25 +292,21 @@ def test_a_search_ends_by_cancel(bench) -> None:
         answer = bench.ros.result(future)
         assert answer.status == 5  # canceled
         assert answer.result.code == "CANCELLED"
-
-
-def test_a_search_ends_with_the_node(bench) -> None:
-    planner = waiting_planner(bench)
+    planner.searching.clear()
+    planner.ended.clear()
     bench.start(bench.move_client, bench.named())
     bench.ros.spin_until(planner.searching.is_set, what="the search")
     bench.node.close()
     assert planner.ended.is_set()
 
 
-def test_the_controller_sees_whose_goal_it_is_before_the_hold_is_announced(bench) -> None:
-    """It may have heard the announcement that the motion node has not: goals and topics keep no common order."""
+@pytest.mark.requirement("P-21")
+def test_an_arm_that_a_client_holds_moves_for_that_client_alone_and_its_controller_sees_whose_goal_it_is(bench) -> None:
+    # the controller may have heard an announcement that the motion node has not: topics keep no common order
     mine = UUID(uuid=list(range(16)))
     assert bench.run(bench.move_client, bench.named("right", "home"), goal_uuid=mine).success
     assert bench.robot.goal_ids[-1][:8] == bytes(range(8))
 
-
-@pytest.mark.requirement("P-21")
-def test_an_arm_that_a_client_holds_moves_for_that_client_alone_and_its_controller_sees_whose_goal_it_is(bench) -> None:
     holder = Holder(bench.node)
     holder.name = "the grasp node (a grasp of 'red')"
     holder.hold("right")

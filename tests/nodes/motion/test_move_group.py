@@ -32,12 +32,14 @@ from moveit_msgs.srv import (
     QueryPlannerInterfaces,
 )
 from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
 from shape_msgs.msg import SolidPrimitive
 from std_msgs.msg import String
 
 from openarm_common import se3
 from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix
 from openarm_common.ros.node import QOS_LATCHED
+from tests.nodes.motion.conftest import SLOWER
 
 pytestmark = pytest.mark.requirement("R-28", "A-76", "B-41")
 
@@ -133,7 +135,13 @@ def test_a_joint_goal_is_planned_shown_and_executed(client: Client) -> None:
 
 
 @pytest.mark.requirement("B-40")
-def test_move_action_plans_and_moves_to_a_pose_within_its_tolerance(client: Client) -> None:
+def test_move_action_plans_and_moves_to_a_pose_within_its_tolerance_unless_it_is_to_plan_only(client: Client) -> None:
+    before = client.q()
+    goal = MoveGroup.Goal(request=client.joint_goal(client.named()))
+    goal.planning_options.plan_only = True
+    assert client.bench.run(client.move, goal).error_code.val == Codes.SUCCESS
+    assert client.q() == pytest.approx(before, abs=1e-6)
+
     T = client.arm.kinematics.fk(client.named())
     T[:3, 3] += (0.02, 0.03, 0.04)
 
@@ -145,52 +153,24 @@ def test_move_action_plans_and_moves_to_a_pose_within_its_tolerance(client: Clie
     assert len(result.planned_trajectory.joint_trajectory.points) > 2
 
 
-def test_plan_only_moves_nothing(client: Client) -> None:
-    before = client.q()
+def test_a_goal_that_is_cancelled_or_stopped_by_the_event_ends_with_the_arm_holding(client: Client) -> None:
     goal = MoveGroup.Goal(request=client.joint_goal(client.named()))
-    goal.planning_options.plan_only = True
-
-    assert client.bench.run(client.move, goal).error_code.val == Codes.SUCCESS
-    assert client.q() == pytest.approx(before, abs=1e-6)
-
-
-def test_a_goal_that_is_cancelled_ends_with_the_arm_holding(client: Client) -> None:
-    goal = MoveGroup.Goal(request=client.joint_goal(client.named()))
-    goal.request.max_velocity_scaling_factor = goal.request.max_acceleration_scaling_factor = 0.05
-    handle, future = client.bench.start(client.move, goal)
-    client.ros.spin_until(lambda: SIDE in client.bench.robot.active, what="the arm to set out")
-
-    handle.cancel_goal_async()
-
-    assert client.ros.result(future).result.error_code.val == Codes.PREEMPTED
-    assert SIDE not in client.bench.robot.active
-
-
-def test_the_event_stop_ends_what_is_executed(client: Client) -> None:
-    goal = MoveGroup.Goal(request=client.joint_goal(client.named()))
-    goal.request.max_velocity_scaling_factor = goal.request.max_acceleration_scaling_factor = 0.05
+    goal.request.max_velocity_scaling_factor = goal.request.max_acceleration_scaling_factor = 0.1
+    client.bench.robot.speed = SLOWER
     publisher = client.node.create_publisher(String, "/trajectory_execution_event", 1)
     client.ros.spin_until(publisher.get_subscription_count, what="a listener")
-    _, future = client.bench.start(client.move, goal)
-    client.ros.spin_until(lambda: SIDE in client.bench.robot.active, what="the arm to set out")
-
-    publisher.publish(String(data="stop"))
-
-    assert client.ros.result(future).result.error_code.val == Codes.PREEMPTED
-
-
-def test_a_start_state_is_where_a_plan_begins(client: Client) -> None:
-    start, request = client.named(), client.joint_goal(client.named("hands_up"))
-    request.start_state.joint_state.name = list(client.arm.names)
-    request.start_state.joint_state.position = start.tolist()
-
-    answer = client.plan(request)
-
-    assert answer.error_code.val == Codes.SUCCESS, answer.error_code.message
-    assert answer.trajectory.joint_trajectory.points[0].positions == pytest.approx(start, abs=1e-6)
+    stop = lambda _: publisher.publish(String(data="stop"))  # noqa: E731
+    for end in (ClientGoalHandle.cancel_goal_async, stop):
+        handle, future = client.bench.start(client.move, goal)
+        client.bench.under_way(SIDE)
+        end(handle)
+        assert client.ros.result(future).result.error_code.val == Codes.PREEMPTED
+        assert SIDE not in client.bench.robot.active
 
 
-def test_a_path_constraint_holds_at_every_point(client: Client) -> None:
+def test_a_path_constraint_holds_at_every_point_from_the_start_state_and_a_start_that_violates_it_is_named_so(
+    client: Client,
+) -> None:
     start = client.arm.kinematics.fk(client.named())
     there = start.copy()
     there[:3, 3] += (0.03, 0.08, 0.05)
@@ -210,17 +190,14 @@ def test_a_path_constraint_holds_at_every_point(client: Client) -> None:
         R = client.arm.kinematics.fk(q)[:3, :3]
         tilt = np.arccos(np.clip((start[:3, :3].T @ R)[2, 2], -1.0, 1.0))
         assert tilt < 0.08
+    assert points[0].positions == pytest.approx(client.named(), abs=1e-6), "the start state"
 
-
-def test_a_start_that_violates_the_path_constraint_is_named_so(client: Client) -> None:
     request = client.joint_goal(client.named("hands_up"))
     first = client.arm.names[0]
     request.path_constraints.joint_constraints = [
         JointConstraint(joint_name=first, position=float(client.q()[0]) + 0.5, tolerance_above=0.1, tolerance_below=0.1)
     ]
-
     answer = client.plan(request)
-
     assert answer.error_code.val == Codes.START_STATE_VIOLATES_PATH_CONSTRAINTS
     assert first in answer.error_code.message
 
@@ -242,19 +219,6 @@ def test_a_straight_line_is_followed_as_far_as_it_goes(client: Client) -> None:
     assert client.arm.kinematics.fk(client.end(whole.solution)) == pytest.approx(near, abs=1e-3)
     assert 0.0 <= part.fraction < 0.5
     assert part.error_code.message
-
-
-def test_a_workspace_bounds_the_base_of_the_robot(client: Client) -> None:
-    request = client.joint_goal(client.named())
-    low, high = request.workspace_parameters.min_corner, request.workspace_parameters.max_corner
-    low.x, low.y, low.z, high.x, high.y, high.z = 0.2, -1.0, -1.0, 1.0, 1.0, 1.0
-    refused = client.plan(request)
-    low.x = -0.2
-    planned = client.plan(request)
-
-    assert refused.error_code.val == Codes.FAILURE
-    assert "leave the robot's base out" in refused.error_code.message
-    assert planned.error_code.val == Codes.SUCCESS, planned.error_code.message
 
 
 def test_ik_and_fk_are_each_others_inverse(client: Client) -> None:
@@ -327,18 +291,19 @@ def test_bodies_are_put_moved_attached_and_detached(client: Client) -> None:
     assert seen.world.collision_objects[0].primitives[0].dimensions == pytest.approx([0.05] * 3)
 
 
-def test_a_change_is_in_force_all_or_nothing(client: Client) -> None:
+def test_a_change_is_in_force_all_or_nothing_and_what_may_touch_blocks_nothing(client: Client) -> None:
     scene = PlanningScene()
     scene.world.collision_objects = [
         client.box(se3.make(None, (0.5, 0.5, 1.0)), "a"),
         CollisionObject(id="unknown", operation=CollisionObject.REMOVE),
     ]
-
     assert not client.apply(scene)
     assert not client.scene().world.collision_objects
+    matrix = client.scene().allowed_collision_matrix
+    for row in matrix.entry_values:
+        row.enabled = [False] * len(row.enabled)
+    assert not client.apply(PlanningScene(allowed_collision_matrix=matrix))
 
-
-def test_what_may_touch_no_longer_blocks(client: Client) -> None:
     T = client.arm.kinematics.fk(client.named())
     scene = PlanningScene()
     scene.world.collision_objects = [client.box(T)]
@@ -358,15 +323,7 @@ def test_what_may_touch_no_longer_blocks(client: Client) -> None:
     assert free.error_code.val == Codes.SUCCESS, free.error_code.message
 
 
-def test_a_pair_of_the_srdf_cannot_be_checked_again(client: Client) -> None:
-    matrix = client.scene().allowed_collision_matrix
-    for row in matrix.entry_values:
-        row.enabled = [False] * len(row.enabled)
-
-    assert not client.apply(PlanningScene(allowed_collision_matrix=matrix))
-
-
-def test_unknown_groups_links_and_pipelines_are_refused_by_name(client: Client) -> None:
+def test_what_is_unknown_not_supported_or_leaves_the_base_out_is_refused_by_name(client: Client) -> None:
     request = client.joint_goal(client.named())
     request.group_name = "no_such_group"
     assert client.plan(request).error_code.val == Codes.INVALID_GROUP_NAME
@@ -378,19 +335,22 @@ def test_unknown_groups_links_and_pipelines_are_refused_by_name(client: Client) 
     request = client.joint_goal(client.named())
     request.pipeline_id = "chomp"
     assert "'chomp'" in client.plan(request).error_code.message
+    answer = client.call(QueryPlannerInterfaces, "/query_planner_interface", QueryPlannerInterfaces.Request())
+    assert [(p.pipeline_id, list(p.planner_ids)) for p in answer.planner_interfaces] == [("openarm", ["fast"])]
 
-
-def test_what_is_not_supported_is_refused_and_on_diagnostics(client: Client) -> None:
     request = client.joint_goal(client.named())
     request.max_cartesian_speed = 0.1
-
     answer = client.plan(request)
-
     assert answer.error_code.val not in (Codes.SUCCESS, Codes.UNDEFINED)
     assert "max_cartesian_speed" in answer.error_code.message
     assert "max_cartesian_speed" in client.group._refused[1]
 
-
-def test_the_planner_is_named(client: Client) -> None:
-    answer = client.call(QueryPlannerInterfaces, "/query_planner_interface", QueryPlannerInterfaces.Request())
-    assert [(p.pipeline_id, list(p.planner_ids)) for p in answer.planner_interfaces] == [("openarm", ["fast"])]
+    request = client.joint_goal(client.named())
+    low, high = request.workspace_parameters.min_corner, request.workspace_parameters.max_corner
+    low.x, low.y, low.z, high.x, high.y, high.z = 0.2, -1.0, -1.0, 1.0, 1.0, 1.0
+    refused = client.plan(request)
+    low.x = -0.2
+    planned = client.plan(request)
+    assert refused.error_code.val == Codes.FAILURE
+    assert "leave the robot's base out" in refused.error_code.message
+    assert planned.error_code.val == Codes.SUCCESS, planned.error_code.message
