@@ -8,6 +8,7 @@ conditions with a deadline, never for a time to pass.
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import shutil
 import signal
@@ -109,6 +110,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.hook.pytest_deselected(items=[item for item, keep in zip(items, wanted, strict=True) if not keep])
     items[:] = [item for item, keep in zip(items, wanted, strict=True) if keep]
     items.sort(key=_alone)  # last: until then no worker waits
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    gc.collect()
+    gc.freeze()  # what was imported stays: the collector need not look at it again and again
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
