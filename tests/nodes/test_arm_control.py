@@ -32,7 +32,8 @@ def robot(bridge) -> Bench:
 @pytest.fixture
 def bench(robot: Bench) -> Bench:
     """And the node before it."""
-    robot.ros.add(ArmControl(parameter_overrides=[Parameter(name, value=value) for name, value in PATIENT.items()]))
+    overrides = [Parameter(name, value=value) for name, value in PATIENT.items()]
+    robot.client = robot.ros.add(ArmControl(parameter_overrides=overrides))
     robot.passed_on = robot.collect(JointState, "/arm_control/joint_states", QOS_COMMAND)
     name = "/arm_control/right_joint_trajectory_controller/controller_state"
     robot.states = robot.collect(JointTrajectoryControllerState, name, QOS_COMMAND)
@@ -69,6 +70,9 @@ def test_a_soft_arm_follows_a_motion_and_arrives(bench: Bench) -> None:
     assert clocks == []
     finger = bench.joints[-1].name.index(bench.FINGER)
     assert all(message.velocity[finger] == message.effort[finger] == 0.0 for message in bench.joints)
+    targets = bench.client._driver.targets
+    bench.ros.spin_until(lambda: not np.isnan(targets(0)).all(), what="targets that the controllers say")
+    assert np.isnan(targets(2**62)).all(), "older than asked for"
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory
-from control_msgs.msg import JointTrajectoryControllerState
+from control_msgs.msg import JointTolerance, JointTrajectoryControllerState
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 from unique_identifier_msgs.msg import UUID
@@ -22,10 +22,12 @@ from openarm_bringup.commands import connect
 from openarm_bringup.ros import peer as peer_client
 from openarm_bringup.ros.peer import Peer
 from openarm_common.ros.client import new_context
-from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns
 from openarm_common.ros.holds import Holder
 from openarm_common.ros.node import QOS_COMMAND
+from openarm_control.ros.trajectory_server import trajectory_of
 from tests.conftest import DEADLINE_S
+from tests.nodes.conftest import Bench
 
 
 @pytest.mark.requirement("A-25")
@@ -40,6 +42,19 @@ def test_a_trajectory_is_followed(bench) -> None:
     np.testing.assert_allclose(bench.arm, bench.NEAR_HOME, atol=0.02)
     assert feedback[-1].feedback.joint_names == list(bench.ARM)
     assert abs(feedback[-1].feedback.error.positions[0]) < 0.05
+
+
+def test_stamps_and_tolerances_of_a_goal_are_those_of_the_trajectory() -> None:
+    goal = Bench.goal((0.5, Bench.HOME), (1.0, Bench.NEAR_HOME))
+    goal.trajectory.header.stamp = ns_to_stamp(12_500_000_000)
+    goal.goal_time_tolerance.sec = 2
+    goal.path_tolerance = [JointTolerance(name=Bench.ARM[1], position=0.1)]
+    goal.goal_tolerance = [JointTolerance(name=Bench.ARM[2], position=0.2)]
+    trajectory = trajectory_of(goal)
+    assert (trajectory.start_ns, trajectory.goal_time_s) == (12_500_000_000, 2.0)
+    assert trajectory.path_tolerance == {Bench.ARM[1]: 0.1}
+    assert trajectory.goal_tolerance == {Bench.ARM[2]: 0.2}
+    assert (trajectory.names, trajectory.t.tolist()) == (Bench.ARM, [0.5, 1.0])
 
 
 def test_the_topics_of_the_trajectory_controller(bench) -> None:

@@ -93,6 +93,19 @@ def test_joint_states_and_transforms_of_wrong_form_are_counted_and_change_nothin
     assert list(listener.buffer._static) == ["table"]
 
 
+def test_between_joint_states_a_joint_follows_its_velocities(ros) -> None:
+    """The cubic in the middle: 20 ms / 8 of the difference of the velocities."""
+    listener = RobotStateListener(ros.add(BaseNode("eye", Config)), RobotDescription.load())
+    joints = ros.node.create_publisher(JointState, "/joint_states", reliable(100))
+    ros.spin_until(joints.get_subscription_count, what="the eye listens")
+    for t_ns, velocity in ((0, 0.1), (20_000_000, -0.1)):
+        message = JointState(name=["openarm_right_joint1"], position=[0.3], velocity=[velocity])
+        message.header.stamp = ns_to_stamp(t_ns)
+        joints.publish(message)
+    ros.spin_until(lambda: len(listener.buffer._states) == 2, what="both joint states")
+    assert listener.buffer.joints_at(10_000_000)["openarm_right_joint1"] == pytest.approx(0.3005, abs=1e-6)
+
+
 def test_joint_states_are_subscribed_to_while_any_user_wants_them(ros) -> None:
     listener = RobotStateListener(ros.add(BaseNode("eye", Config)), RobotDescription.load(), joints=False)
     subscribers = lambda: ros.node.count_subscribers("/joint_states")  # noqa: E731

@@ -188,6 +188,9 @@ def test_lookup_goes_through_static_edges_and_moving_links(buffer: RobotStateBuf
     buffer.set_static("base", "table", se3.make(None, (0.0, 0.0, 0.4)))
     T = buffer.lookup("table", "camera", 10 * MS)
     assert np.allclose(T[:3, 3], (0.1, 0.2, 0.1))
+    buffer.set_static("camera", "optical", se3.make(se3.rot_z(np.pi / 2), (0.0, 0.0, 0.3)))
+    buffer.set_static("optical", "mark", se3.make(None, (1.0, 0.0, 0.0)))
+    assert np.allclose(buffer.lookup("hand", "mark", 10 * MS)[:3, 3], (0.0, 1.2, 0.3))
 
 
 def test_fixed_frames_need_no_joint_state(buffer: RobotStateBuffer) -> None:

@@ -84,3 +84,9 @@ def test_interpolation_meets_both_ends(T_a: np.ndarray, T_b: np.ndarray) -> None
 def test_urdf_rpy_is_fixed_axis() -> None:
     R = se3.matrix_from_rpy(0.1, 0.2, 0.3)
     assert np.allclose(R, se3.rot_z(0.3) @ se3.rot_y(0.2) @ se3.rot_x(0.1))
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
+def test_rpy_of_an_upright_pitch_gives_the_rotation_again(pitch: float) -> None:
+    R = se3.matrix_from_rpy(0.4, pitch, 0.0)
+    assert np.allclose(se3.matrix_from_rpy(*se3.rpy_from_matrix(R)), R)

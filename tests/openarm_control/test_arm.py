@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -299,3 +301,12 @@ def test_the_tracker_arrives_without_overshoot(target: float, v: float, a: float
         furthest = max(furthest, abs(tracker.position[0]))
     assert tracker.position[0] == target
     assert furthest <= abs(target) + 1e-12
+
+
+def test_an_arm_that_swings_about_its_goal_has_not_reached_it() -> None:
+    swing = itertools.cycle((0.01, -0.01))
+    arm = Arm(plant=lambda q, target: target + next(swing))
+    arm.start(**CUBIC, goal_time_s=0.5)
+    outcome = arm.run()
+    assert (outcome.end, outcome.result) == (End.ABORTED, TrajectoryResult.GOAL_TOLERANCE_VIOLATED)
+    assert "moves at 2.000 rad/s" in outcome.text

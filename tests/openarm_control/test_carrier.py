@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.servos import ServoModel
 from openarm_common.scene.scene import load_scene
 from openarm_control.arm import TrajectoryConfig, TrajectoryOutcome
-from openarm_control.carrier import CarrierConfig
+from openarm_control.carrier import Carrier, CarrierConfig
 from openarm_control.gripper import GripperFollower
-from openarm_control.loop_gains import safe_gains
+from openarm_control.loop_gains import LoopGains, safe_gains
 from openarm_control.trajectory import Trajectory, TrajectoryResult
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.hardware import HardwareConfig
@@ -166,3 +167,16 @@ def test_gains_fall_with_the_latency_and_with_the_inertia() -> None:
         assert np.all(later.proportional < nearer.proportional)
     assert np.all(safe_gains(stiffness, damping, heavy, delays[0]).proportional < found[0].proportional)
     assert np.all(found[0].integral > 0.0)
+
+
+def test_what_adds_up_at_rest_has_a_limit() -> None:
+    one, nothing = np.ones(1), np.zeros(1)
+    carrier = Carrier(
+        ServoModel(one, nothing, nothing, nothing, nothing, weight=1.0),
+        CarrierConfig(settle_limit=0.05),
+        gains=LoopGains(nothing, nothing, one),
+    )
+    for error, most in ((0.3, 0.05), (-0.3, -0.05)):
+        for _ in range(100):
+            carrier.settle(np.array([error]), 0.1)
+        assert carrier.target(nothing, nothing, nothing, nothing, 0.01) == pytest.approx(most)

@@ -166,3 +166,18 @@ def test_bad_gripper_goals_are_refused_with_joint_and_value(kwargs: dict, code: 
     with pytest.raises(OpenArmError, match=message) as caught:
         Finger().follower.check(GripperGoal(**kwargs))
     assert caught.value.code is code
+
+
+def test_rests_on_the_way_do_not_add_up_to_a_stall() -> None:
+    finger = Finger()
+    finger.start(0.0)
+    finger.tick(100)
+    finger.start(0.0, max_effort=5.0)
+    short = int(0.8 * GripperConfig().stall_time / 0.01)
+    for velocity in 3 * [*short * [0.0], 0.1]:
+        finger.update(0.03, velocity, -5.0)
+        finger.t_ns += 10 * MS
+    assert len(finger.outcomes) == 1
+    for _ in range(2 * short):
+        finger.update(0.03, 0.0, -5.0)
+    assert finger.outcomes[-1].stalled

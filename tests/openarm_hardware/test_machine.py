@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from openarm_common.motors import frames
 from openarm_common.motors.bus import Frame
 from openarm_hardware.arm import Phase
+from openarm_hardware.axis import MotorAxis
 from openarm_hardware.exchange import Command
-from tests.openarm_hardware.bench import PERIOD_NS, Bench
+from openarm_hardware.settings import Settings
+from tests.openarm_hardware.bench import PERIOD_NS, Bench, made_axes
 
 pytestmark = pytest.mark.requirement("R-08")
 
@@ -228,6 +230,24 @@ def test_without_fresh_commands_the_arms_hold_and_go_on_with_the_next() -> None:
     bench.client = good
     bench.run(0.1)
     assert bench.machine.text == ""
+
+
+def test_a_command_that_is_old_when_it_comes_is_not_followed() -> None:
+    bench = Bench().up()
+    away = tuple((q if axis.grips else q + 0.3, t) for (q, t), axis in zip(bench.here(), bench.axes, strict=True))
+    before, bench.client = bench.q(), None
+    bench.run(1.0)
+    for _ in range(100):
+        bench.command = Command(bench.now_ns - int(2e9 * bench.settings.stale_s), away)
+        bench.tick()
+    assert bench.q() == pytest.approx(before, abs=0.002)
+
+
+def test_a_gear_divides_the_speed_and_multiplies_the_torque() -> None:
+    axis = MotorAxis(made_axes()[7], Settings())
+    axis.take(frames.encode_feedback(axis.kind, frames.Feedback(1, 8, -0.5, 2.0, 0.4, 30, 40)), 1)
+    assert axis.dq == pytest.approx(2.0 / -23.8, rel=0.01)
+    assert axis.tau == pytest.approx(0.4 * -23.8, rel=0.02)
 
 
 @pytest.mark.requirement("B-55")

@@ -12,6 +12,8 @@ from pydantic import ValidationError
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
+from openarm_sim_bridge.faults.faults import checked_fault
+from openarm_sim_bridge.faults.world_faults import WorldFaults
 from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
 from openarm_sim_bridge.world.model import PhysicsConfig, robot_spec
 from openarm_sim_bridge.world.stage import Stage
@@ -127,3 +129,18 @@ def test_gains_for_other_arms_are_refused(description: RobotDescription) -> None
 def test_an_impossible_robot_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         HardwareConfig.model_validate(wrong)
+
+
+@pytest.mark.parametrize(("side", "late"), [(SIDES[0], [True, False]), ("both", [True, True])])
+def test_commands_are_late_for_the_side_that_is_named(
+    description: RobotDescription, side: str, late: list[bool]
+) -> None:
+    stage, world = world_of(description, IDEAL)
+    faults = WorldFaults(description, world.joint_names)
+    faults.inject(checked_fault("joint_late", {"ms": 100.0, "side": side}), world)
+    faults.prepare(world)
+    before = world.read_joints().position
+    world.set_targets(np.array([stage.home[name] for name in stage.joint_names]) + 0.1)
+    world.step(20)
+    moved = dict(zip(world.joint_names, np.abs(world.read_joints().position - before), strict=True))
+    assert [max(moved[name] for name in description.arm_joints(arm)) < 1e-3 for arm in SIDES] == late
