@@ -137,6 +137,22 @@ def test_arms_go_where_frames_tell_them_and_are_carried_by_torque(rig: Rig) -> N
     assert at[7] == pytest.approx(rig.wanted[7], abs=0.002)
 
 
+def test_the_laws_of_joints_are_those_of_their_motors_behind_the_gears(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Were they twice as fast, and turned the other way."""
+    laws: list[np.ndarray] = []
+    monkeypatch.setattr(rig.motors, "_ratio", -2.0 * rig.motors._ratio)
+    monkeypatch.setattr(rig.world, "set_laws", lambda *of_joints: laws.extend(of_joints))
+    rig.motors.update(rig.robot.state, 2_000_000)
+    bias, stiffness, damping = laws
+    for i, motor in enumerate(rig.motors.buses.motors):
+        at_rest, kp, kd, _ = motor.law()
+        r, q, dq = -2.0 * motor.axis.ratio, 0.3, 0.2
+        torque = at_rest - kp * (r * q + motor.axis.offset) - kd * r * dq
+        assert bias[i] - stiffness[i] * q - damping[i] * dq == pytest.approx(r * torque)
+
+
 def test_a_fault_of_a_motor_lets_its_arm_sink_and_the_other_hold(rig: Rig) -> None:
     joint = next(axis.joint for axis in rig.axes if axis.id == 2)
     before = lifted(rig)

@@ -197,6 +197,16 @@ def test_a_paused_world_stands_shows_life_and_steps(bench: Bench) -> None:
     bench.wait(lambda: bench.t_ns > t_ns + 500_000_000)
 
 
+def test_steps_that_are_left_when_time_goes_on_are_not_said_to_be_done(bench: Bench) -> None:
+    bench.wait(lambda: bench.states)
+    bench.simulation.call(lambda: bench.simulation.set_paused(True)).result(DEADLINE_S)
+    stepping = bench.simulation.call(lambda: bench.simulation.advance(10_000_000)).result(DEADLINE_S)
+    bench.simulation.call(lambda: bench.simulation.set_paused(False)).result(DEADLINE_S)
+    with pytest.raises(OpenArmError, match="stepping ended early") as caught:
+        stepping.result(DEADLINE_S)
+    assert caught.value.code is Code.CANCELLED
+
+
 def test_steps_are_refused_where_they_make_no_sense(bench: Bench) -> None:
     for steps, code in ((5, Code.NOT_READY), (0, Code.INVALID_ARGUMENT)):
         with pytest.raises(OpenArmError) as caught:
