@@ -117,6 +117,10 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.freeze()  # what was imported stays: the collector need not look at it again and again
 
 
+def pytest_sessionfinish() -> None:
+    gc.unfreeze()
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, object, object]:
     lock = item.config.stash.get(_LOCK, None)

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,10 +19,8 @@ from openarm_common.octree.codec import read_file
 from openarm_evaluation.campaign import campaign, in_process_robot, report, trial
 from openarm_evaluation.campaign.campaign import run_campaign
 from openarm_evaluation.campaign.options import CampaignOptions
-from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.progress import pace
 from openarm_evaluation.campaign.robot import SimulatedSenses
-from openarm_evaluation.campaign.tasks.faults import KINDS
 from openarm_evaluation.campaign.tasks.suites import SUITES, make_task
 from openarm_evaluation.campaign.tasks.task import FaultPlan
 from openarm_evaluation.campaign.tasks.things import THINGS
@@ -33,7 +29,6 @@ from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.strategies.registry import carry_out
 from openarm_octomap.config import GridConfig
 from openarm_octomap.grid import OccupancyGrid
-from openarm_perception.detection.faults import DetectionFaults
 from tests.tag_paint import paint
 
 
@@ -258,33 +253,6 @@ def test_an_object_is_picked_by_the_tag_on_it(tmp_path) -> None:
     there = truth()[:3, 3]
     assert np.linalg.norm(there[:2] - outcome.place_position[:2]) < 0.02
     assert np.linalg.norm(there - start) > 0.05
-
-
-#: The map is renewed less often, and two attempts are enough: every kind takes a second or two.
-QUICK = SimulatedSenses(depth_noise=False, sets=("octomap.period=2.0", "grasp.limits.max_attempts=2"))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.requirement("N-03", "N-05")
-def test_every_kind_of_fault_ends_with_a_recovery_or_the_right_code(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    missed, seen = list[int](), DetectionFaults.seen
-
-    def count_missed(faults: DetectionFaults, found: Sequence[Any], t_ns: int) -> tuple[Any, ...]:
-        kept = seen(faults, found, t_ns)
-        missed.append(len(found) - len(kept))
-        return kept
-
-    monkeypatch.setattr(DetectionFaults, "seen", count_missed)
-    task = make_task("faults", list(KINDS).index(kind))
-    assert task.kind == kind
-    run = trial.Trials(task, QUICK, suite_config(QUICK.parameters()).grasp)
-    found = run.run()
-    assert found["as_expected"], f"{found['outcome']}, {found['code']}: {found['message']}; {found['expected']}"
-    assert run.injected == (task.fault is not None)
-    assert any(missed) == (kind == "detection_missed")
-    assert any("by fault injection" in step.reason for step in run.steps) == (kind == "plan_fails_once")
-    assert found["attempts"] == 2 or not kind.startswith(("nudged", "gripper_stuck_once"))
 
 
 @pytest.mark.long
