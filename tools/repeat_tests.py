@@ -23,8 +23,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = ("core", "nodes", "graph", "other")
-#: How `openarm test` shares tests out: files in two processes; tests marked `alone` have the machine for themselves.
-SHARED = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
+#: How `openarm test` shares tests out: files in three processes; tests marked `alone` have the machine for themselves.
+SHARED = ("-n", "3", "--dist", "loadfile", "--no-loadscope-reorder")
 
 
 @dataclass

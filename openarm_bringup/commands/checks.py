@@ -19,9 +19,9 @@ from openarm_common.errors import Code, OpenArmError
 #: Folders of tests that mostly wait, for messages and processes: they run while those of the others compute.
 WAITING = ("graph", "nodes")
 
-#: Number of processes that share the tests, file by file, and of processors that they need; tests marked `alone` run by
-#: themselves.
-WORKERS = 2
+#: Number of processes that share the tests, file by file, on two processors or more: one of three mostly waits. Tests
+#: marked `alone` run by themselves.
+WORKERS = 3
 #: What pytest can't do, or shows less of, when tests run in other processes.
 NEEDS_ONE_PROCESS = ("-s", "--capture=no", "--pdb", "--trace", "--collect-only", "--co", "no:xdist")
 
@@ -35,7 +35,7 @@ def test(*args: Rest, every: Annotated[bool, Parameter(name="--all", negative=""
     """Run the tests of cores and nodes, and of a graph that grasps; print the slowest and what was skipped.
 
     Args:
-        args: Passed to pytest; without a path, all files run, in two processes (-n 0: in one).
+        args: Passed to pytest; without a path, all files run, in three processes (-n 0: in one).
         every: Run the long tests, too: faults, campaigns, other robots, replays, two hosts, whatever measures time.
     """
     root = _checkout()
@@ -110,7 +110,7 @@ def _in_order(tests: Path) -> list[str]:
 
 def _shared_out() -> list[str]:
     """Return options that run tests in several processes, where there are processors for them."""
-    if len(os.sched_getaffinity(0)) < WORKERS:
+    if len(os.sched_getaffinity(0)) == 1:
         return []
     return ["-n", str(WORKERS), "--dist", "loadfile", "--no-loadscope-reorder"]
 
