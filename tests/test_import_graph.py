@@ -9,25 +9,11 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+import structure
 
 ROOT = Path(__file__).parents[1]
-
-
-def _structure() -> ModuleType:
-    """tools/structure.py as a module; tools/ is no package."""
-    spec = importlib.util.spec_from_file_location("openarm_structure", ROOT / "tools" / "structure.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # its dataclasses look themselves up there
-    spec.loader.exec_module(module)
-    return module
-
-
-structure = _structure()
 PACKAGES = sorted(path.name for path in ROOT.glob("openarm_*") if (path / "__init__.py").is_file())
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py") if path.name != "setup.py")
 

@@ -3,17 +3,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from pathlib import Path
 
 import pytest
+from seeded_faults import Fault, load, report, try_fault
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
-
-from seeded_faults import Fault, load, report, try_fault  # noqa: E402
-
 FAULTS = load()
 
 

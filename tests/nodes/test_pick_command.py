@@ -43,6 +43,8 @@ def test_a_second_ctrl_c_is_the_emergency_stop(ros, capsys: pytest.CaptureFixtur
         for what in ("goal", "cancel"):
             while what not in asked:
                 ros.executor.spin_once(timeout_sec=0.05)
+                if ended.is_set():
+                    return
             os.kill(os.getpid(), signal.SIGINT)
         while not ended.is_set():
             ros.executor.spin_once(timeout_sec=0.05)
