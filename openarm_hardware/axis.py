@@ -67,10 +67,11 @@ class MotorAxis:
     # --- replies
     def take(self, data: bytes, now_ns: int) -> str:
         """Take a frame with the reply id; return why its state can't be trusted, else nothing."""
-        reply = frames.decode_register(data) if self.status <= 0 or not self.configured else None
-        if reply is not None and reply.id == self.axis.id and reply.register in self._wanted:
-            self.registers[reply.register] = reply.value
-            self.configured = self._wanted.items() <= {k: round(v, 3) for k, v in self.registers.items()}.items()
+        reply = frames.decode_register(data)
+        if reply is not None and reply.id == self.axis.id:  # in any phase: a reply may be late
+            if reply.register in self._wanted:
+                self.registers[reply.register] = reply.value
+                self.configured = self._wanted.items() <= {k: round(v, 3) for k, v in self.registers.items()}.items()
             self.asked = False
             return ""
         state = frames.decode_feedback(self.kind, data)

@@ -101,6 +101,23 @@ def test_joint_states_keep_the_rate_of_control(bench: Bench) -> None:
 
 
 @pytest.mark.requirement("R-08", "R-10")
+def test_a_motor_s_fault_is_reported_by_name_refuses_goals_and_is_reset_when_it_is_gone(bench: Bench) -> None:
+    bench.inject("motor_fault", f"{{kind: error, joint: {bench.ARM[2]}, value: 12}}")
+    bench.ros.spin_until(lambda: bench.report().get("right_phase") == "DAMPED", what="the arm sinks")
+    assert bench.ARM[2] in bench.message()
+    assert "rotor too hot" in bench.message()
+    assert bench.report()["left_phase"] == "HELD"
+    assert bench.level() != b"\0"
+    _, refused = bench.follow(bench.goal((1.0, START)))
+    assert "rotor too hot" in bench.ros.result(refused).result.error_string
+    bench.clear()
+    bench.call(Trigger, "/openarm_hardware/reset")
+    bench.ros.spin_until(lambda: bench.level() == b"\0", what="the arms are up again")
+
+
+@pytest.mark.long
+@pytest.mark.alone
+@pytest.mark.requirement("R-08", "R-10")
 def test_a_fault_of_a_motor_ends_the_goal_by_name_and_is_reset_when_it_is_gone(bench: Bench) -> None:
     _, begun = bench.follow(bench.goal((0.5, START)))
     bench.grip(0.03)

@@ -243,6 +243,20 @@ def test_a_command_that_is_old_when_it_comes_is_not_followed() -> None:
     assert bench.q() == pytest.approx(before, abs=0.002)
 
 
+def test_a_reply_of_a_register_that_comes_late_is_no_position() -> None:
+    bench = Bench().up()
+    late = [
+        (axis.reply_id, frames.register_reply(axis.id, *register, written=False))
+        for axis, motor in zip(bench.axes[:8], bench.motors[:8], strict=True)
+        for register in motor.registers.items()
+    ]
+    bench.waiting = [[*mine, *late] for mine in bench.waiting]
+    before = bench.machine.motors()
+    bench.tick()
+    assert bench.phases == UP, bench.machine.text
+    assert [s.q for s in bench.machine.motors()] == pytest.approx([s.q for s in before], abs=0.01)
+
+
 def test_a_gear_divides_the_speed_and_multiplies_the_torque() -> None:
     axis = MotorAxis(made_axes()[7], Settings())
     axis.take(frames.encode_feedback(axis.kind, frames.Feedback(1, 8, -0.5, 2.0, 0.4, 30, 40)), 1)
