@@ -139,10 +139,11 @@ class RosProbe:
     """An executor with nodes in it, driven by conditions; deadlines are in seconds of the wall clock."""
 
     def __init__(self) -> None:
-        from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
 
-        self.executor = SingleThreadedExecutor()
+        from openarm_common.ros.executor import WaitSetExecutor
+
+        self.executor = WaitSetExecutor()
         self.nodes: list[Node] = []
         #: A node to make publishers, subscriptions and clients of the test with.
         self.node = self.add(Node("probe"))

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 import rclpy
 from action_msgs.msg import GoalStatus
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -24,6 +24,7 @@ from std_msgs.msg import Empty
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.fields import check_message
 from openarm_common.ros.actions import ActionClient, Watch, alive_topic, check_alive
+from openarm_common.ros.executor import WaitSetExecutor
 
 #: Period of checks that the server is still there, s.
 _CHECK_S = 0.25
@@ -67,7 +68,7 @@ class ContextNode:
             start_parameter_services=not bare,
             enable_rosout=not bare,
         )
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = WaitSetExecutor(context=self._context)
         self._executor.add_node(self._node)
 
     def __enter__(self) -> Self:

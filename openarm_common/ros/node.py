@@ -26,7 +26,7 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -39,6 +39,7 @@ from openarm_common.errors import OpenArmError
 from openarm_common.printable import brief
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.actions import LEASE, RCLError, alive_topic, latest, show_life
+from openarm_common.ros.executor import WaitSetExecutor
 from openarm_common.ros.log import PrintableLogger
 
 ConfigT = TypeVar("ConfigT", bound=Config)
@@ -350,7 +351,7 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
         node = factory()
         if not rclpy.ok():  # the signal came while the node was being made
             raise ExternalShutdownException
-        executor = SingleThreadedExecutor()
+        executor = WaitSetExecutor()
         for one in (node, *node.companions):
             executor.add_node(one)
         signals.node = node
