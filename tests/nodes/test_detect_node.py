@@ -139,6 +139,8 @@ def test_the_height_of_the_table_is_measured_from_its_surface_or_a_block(ros, be
     assert f"{block.height:.4f} m high; the detector takes it for 0.4100 m" in block.message
     for fields, text in (({"block_height": 3.0}, "0.005 .. 0.5"), ({"block_height": 0.05, "label": "blue"}, "'blue'")):
         assert text in ask(**fields).message
+    ros.spin_until(lambda: not node.measurable, what="the newest image is old")
+    assert ros.call(client, MeasureTable.Request()).code == "NOT_READY"
 
 
 @pytest.mark.requirement("B-04", "A-61")

@@ -150,3 +150,13 @@ def test_what_does_not_belong_together_is_refused():
     builder = FrameBuilder(camera_topics(TOPICS), DepthLimits())
     assert builder.take(TOPICS[0], color) is None
     assert builder.missing() == f"nothing on {TOPICS[1]}, {TOPICS[2]}"
+
+
+def test_colour_and_depth_of_different_times_make_no_frame():
+    topics = camera_topics(TOPICS)
+    (color, _, info), (_, late, _), (_, near, _) = messages(0), messages(100_000_000), messages(10_000_000)
+    builder = FrameBuilder(topics, DepthLimits())
+    for topic, message in ((topics.color, color), (topics.info, info), (topics.depth, late)):
+        assert builder.take(topic, message) is None
+    assert builder.missing() == "no colour and depth image of the same time"
+    assert builder.take(topics.depth, near) is not None

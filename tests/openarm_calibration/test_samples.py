@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from openarm_calibration.handeye.left_out import side_by_side
+from openarm_calibration.handeye.limits import Limits
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.verdict import assess, estimate_delay
@@ -176,6 +177,9 @@ def test_the_verdict_has_held_out_errors_and_reasons(session) -> None:
     solution = solve(problem)
     good = assess(problem, solution, stored=known.X)
     assert good.grade == "pass", good.reasons
+    sigma = good.figures["sigma_translation"]
+    grades = [assess(problem, solution, Limits(translation=sigma / ratio)).grade for ratio in (0.9, 2.0, 5.0)]
+    assert grades == ["pass", "warn", "fail"]
     assert good.figures["leave_one_out"] < 0.5e-3
     assert 0.0 < good.figures["five_fold_px"] < 0.5
     assert abs(good.figures["scale"] - 1.0) < 0.003

@@ -12,8 +12,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from openarm_bringup.cli import run
+from openarm_calibration.handeye.problem import layout
 from openarm_calibration.handeye.solve import solve
 from openarm_calibration.handeye.touch import Touch, add_touch, check_touches, read_touches
+from openarm_calibration.handeye.transforms import moved
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from tests.openarm_calibration.known_session import Known, make_session
@@ -78,6 +80,22 @@ def test_a_zero_that_is_off_or_another_tip_is_found() -> None:
         checked = check_touches(known.samples, solution, found, tip=tip, steady=5e-4)
         assert not checked.agrees
         assert np.linalg.norm(checked.mean) > 3e-3
+
+
+def test_the_predicted_error_of_a_mark_is_that_of_the_board_carried_to_it() -> None:
+    """Next to the marks of boards that are drawn with the covariance of the board's pose."""
+    known, rng = make_session(), np.random.default_rng(1)
+    solution = solve(known.samples.problem())
+    estimate = solution.estimate
+    one = touches(known, "left", TIP, 0.0, rng)[-1]  # far from the middle of the board
+    predicted = check_touches(known.samples, solution, [one], tip=TIP, steady=0.0).predicted
+    first = layout(solution.problem, estimate.extras)["Z"].start
+    covariance = estimate.covariance()[first : first + 6, first : first + 6]
+    changes = rng.multivariate_normal(np.zeros(6), covariance, 20_000)
+    boards = moved(np.repeat(estimate.Z[:1], len(changes), axis=0), changes)
+    marks = boards[:, :3, :3] @ known.samples.board.points[one.mark] + boards[:, :3, 3]
+    spread = marks.var(axis=0).sum() + 3.0 * estimate.noise.translation**2
+    assert predicted == pytest.approx(np.sqrt(spread), rel=0.03)
 
 
 def test_what_can_not_be_compared_is_refused_by_name() -> None:

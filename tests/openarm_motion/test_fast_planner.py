@@ -12,12 +12,15 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_motion.collision.clearance_kernels import workspace
+from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.planning.arm import Arm, StartState, segment_time
 from openarm_motion.planning.dual_arm import DualArm
 from openarm_motion.planning.ompl_planner import OmplPlanner
 from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.rrt import FastPlanner
+from openarm_motion.planning.search_kernels import grow
 from tests.openarm_motion.conftest import ruckig_duration
 
 
@@ -54,6 +57,23 @@ def test_paths_between_any_states_are_free_for_the_exact_layer(
         for a, b in itertools.pairwise(path.waypoints):
             assert scene.edge_free(a, b, 0.05, 0.02)
     assert searched > 5
+
+
+def test_every_edge_of_both_trees_is_free(right: Arm, home: dict[str, float]) -> None:
+    """Long ones, so that a free end says little."""
+    start, goal = free_states(right, home, 2, 3, CLUTTER)
+    scene = FastScene([right.scene(home, CLUTTER)])
+    bounds, resolution = np.stack([right.kinematics.lower, right.kinematics.upper]), np.array((0.05, 0.02))
+    edges: list[tuple[np.ndarray, np.ndarray]] = []
+    for seed in range(20):
+        trees, parents = np.empty((2, 500, start.size)), np.full((2, 500), -1, np.int64)
+        trees[:, 0], counts = (start, goal), np.array([1, 1], np.int64)
+        work = workspace(scene.model)
+        grow(trees, parents, counts, bounds, 2.0, resolution, scene.levers, scene.model, work, 20, seed)
+        for tree, up, count in zip(trees, parents, counts, strict=True):
+            edges += [(tree[up[k]], tree[k]) for k in range(1, count)]
+    assert len(edges) > 20
+    assert all(scene.edge_free(a, b) for a, b in edges)
 
 
 def test_the_same_query_gives_the_same_path(right: Arm, home: dict[str, float]) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -140,6 +141,17 @@ def test_an_object_is_gone_and_back_within_a_second_at_two_hertz(scene: MapScene
     for i in range(2):
         states = states_after(target, scene, (12 + i) * PERIOD_NS, rng)
     assert (states[near] == OCCUPIED).any()
+
+
+def test_the_robot_is_taken_out_where_it_was_last(scene: MapScene) -> None:
+    """Of frames of different times: what an old one shows of the robot is not in the map where the robot is now."""
+    first, *others = scene.frames(PERIOD_NS)
+    away = scene.joints | scene.description.group_state("right_arm", "wrist_look")
+    old = replace(first, t_ns=0, joints={name: away[name] for name in first.joints})  # shows the arm where it is now
+    for frames in ([old, *others], [*others, old]):
+        target = mapper(scene)
+        assert target.update(frames).reset > 0
+        assert target.update([first]).reset == 0
 
 
 @pytest.mark.parametrize("every", [6, pytest.param(1, marks=pytest.mark.long)])

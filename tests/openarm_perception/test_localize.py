@@ -14,9 +14,10 @@ import pytest
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Detection2D
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
 from openarm_perception.geometry.depth import DepthLimits, View
+from openarm_perception.geometry.footprint import Footprint
 from openarm_perception.geometry.patch import Patch
 
 SHAPES = [
@@ -194,6 +195,15 @@ def test_the_covariance_says_what_is_not_known(tabletop, detector, localizer) ->
     for found in located.values():
         assert 1e-4 < math.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3]).max()) < 2e-3
         np.testing.assert_allclose(found.T_base_object[:3, 2], (0.0, 0.0, 1.0))
+
+
+def test_the_covariance_is_turned_with_the_object(localizer) -> None:
+    """What is uncertain along a side of a box is so along that side in the base frame."""
+    shape = Footprint("rectangle", np.array([0.3, 0.1]), 0.5, (0.05, 0.1), 1e-4, (4e-3, 1e-3), 0.01)
+    seen = Detection2D("box", 1.0, (0.5, 0.5), (1, 1), np.ones((1, 1), bool), truncated=False)
+    found = localizer._detection(seen, shape, 0.45, 100, 1.0)
+    along = np.array([math.cos(0.5), math.sin(0.5), 0.0])
+    assert math.sqrt(along @ found.covariance[:3, :3] @ along) == pytest.approx(4e-3)
 
 
 def refusal(localizer: Localizer, found, view, depth=None) -> OpenArmError:

@@ -56,6 +56,18 @@ def test_mounts_and_optical_frames_of_all_cameras(ros) -> None:
         np.testing.assert_allclose(turn[:3, 0], (0.0, -1.0, 0.0), atol=1e-9)
 
 
+def test_the_right_camera_of_a_pair_goes_with_the_left_one(ros, monkeypatch) -> None:
+    """At the baseline to the right of it, also where the calibrated left one is turned."""
+    monkeypatch.setenv("OPENARM_ROBOT", "openarm_v2_cell")
+    right = load_cameras()["head_right"]
+    T = se3.make(se3.exp_so3((0.1, 0.4, 0.2)), (0.1, 0.2, 0.3))
+    parent = load_cameras()[right.left].parent
+    CalibrationStore(default_folder()).save(StoredCalibration.of_mount(right.left, parent, T))
+    ros.add(PublisherNode())
+    offset = edges(ros)[parent, "head_right_link"][:3, 3] - T[:3, 3]
+    np.testing.assert_allclose(offset, -right.baseline * T[:3, 1], atol=1e-6)
+
+
 @pytest.mark.requirement("A-34", "B-14")
 def test_the_overhead_camera_looks_at_the_region_and_the_wrist_camera_moves_with_the_arm(ros) -> None:
     """Through the tree: the object region projects into the overhead image; joint 1 moves the wrist camera alone."""

@@ -22,6 +22,7 @@ from openarm_common.octree.lattice import Lattice
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, matrix_to_transform
 from openarm_common.ros.node import QOS_LATCHED
+from openarm_motion.ros.convert import solid_from_msg
 
 BASE_FRAME = RobotDescription.load().base
 
@@ -32,6 +33,17 @@ def body(bench, id: str, p, size=(0.05, 0.05, 0.05), shape: str = "box", frame: 
     message = CollisionObject(id=id, shape=shape, pose=bench.stamped(se3.make(None, p), frame))
     message.size = Vector3(x=size[0], y=size[1], z=size[2])
     return message
+
+
+@pytest.mark.requirement("B-50")
+def test_sizes_of_bodies_are_edges_diameters_and_heights() -> None:
+    message = CollisionObject(id="it", size=Vector3(x=0.06, y=0.06, z=0.2))
+    kinds = {}
+    for message.shape in ("box", "cylinder", "sphere"):
+        kinds[message.shape] = solid_from_msg(message, lambda T, _: T)
+    assert kinds["box"].size == pytest.approx((0.06, 0.06, 0.2))
+    assert (kinds["cylinder"].radius, kinds["cylinder"].length) == pytest.approx((0.03, 0.2))
+    assert kinds["sphere"].radius == pytest.approx(0.03)
 
 
 @pytest.mark.requirement("B-63")
