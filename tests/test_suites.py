@@ -16,8 +16,6 @@ GRAPHS = {"start_graph"}
 GRASPS = {
     "openarm_grasp/test_any_shape.py::test_what_is_no_prism_is_grasped_on_its_cloud_and_placed",
     "openarm_grasp/test_no_depth.py::test_an_object_of_known_height_is_picked_without_depth",
-    "openarm_evaluation/test_chain.py::test_with_calibration_and_map_the_box_is_placed_within_5_mm_and_the_screen_is_not_touched",
-    "openarm_evaluation/test_campaign.py::test_two_objects_are_placed_one_after_the_other_without_a_reset",
     "openarm_evaluation/test_campaign.py::test_an_object_is_picked_by_the_tag_on_it",
     "openarm_evaluation/test_campaign_two_arms.py::test_an_object_changes_hands_in_the_middle_and_stands_where_one_arm_alone_cannot_put_it",
     "openarm_evaluation/test_campaign_two_arms.py::test_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped",

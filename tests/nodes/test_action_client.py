@@ -56,7 +56,7 @@ def asked(ros) -> Iterator[Callable[..., list[Any]]]:
 
         with ThreadPoolExecutor(1) as pool:
             done = pool.submit(script)
-            ros.spin_until(done.done, 60.0, "the answers")
+            ros.spin_until(done.done, what="the answers")
             done.result()
         return answers
 

@@ -96,7 +96,7 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp
         published.clear()
         heard = len(diagnostics)
         begin = sent()
-        ros.spin_until(lambda: len(published) > 1000, 60.0, "as many joint states as a report is about")
+        ros.spin_until(lambda: len(published) > 1000, what="as many joint states as a report is about")
         periods = np.diff(published) * 1e-6
         end = sent()
         assert end[1] - begin[1] > 3000.0 * (end[0] - begin[0]) > 0.0, "no flood"

@@ -129,17 +129,26 @@ def test_a_subscriber_that_asks_for_a_deadline_is_notified_of_a_gap(steady) -> N
     got: list[JointState] = []
     missed: list[int] = []
     events = SubscriptionEventCallbacks(deadline=lambda event: missed.append(event.total_count))
-    qos = reliable(10)
+    qos = reliable(2000)  # a starved probe misses none
     qos.deadline = JOINT_STATE_DEADLINE
     node = bench.ros.node
     node.create_subscription(JointState, "/joint_states", got.append, qos, event_callbacks=events)
     bench.ros.spin_until(lambda: len(got) > 20, what="joint states")
+
+    def gaps_ms(seconds: float) -> np.ndarray:
+        """Times between the joint states of so many seconds, from 0.3 s after now on."""
+        begin = bench.t_ns + 300_000_000
+        end = begin + round(seconds * 1e9)
+        bench.ros.spin_until(lambda: stamp_to_ns(got[-1].header.stamp) >= end, what=f"{seconds} s of joint states")
+        heard = np.array([stamp_to_ns(m.header.stamp) for m in got])
+        return np.diff(heard[heard >= begin]) * 1e-6
+
     before = len(missed)
-    bench.inject("joint_state_gap", "{ms: 300, every: 0.4}")
+    bench.inject("joint_state_gap", "{ms: 300, every: 0.4}", seed=3)
+    assert 3 <= np.sum(gaps_ms(1.6) >= 290) <= 5
     bench.ros.spin_until(lambda: len(missed) >= before + 2, what="missed deadlines")
     bench.clear()
-    n = len(got)
-    bench.ros.spin_until(lambda: len(got) > n + 50, what="joint states again")
+    assert gaps_ms(0.5).max() < 100
 
 
 @pytest.mark.requirement("A-73")

@@ -74,7 +74,7 @@ def test_probe_lists_parameters_and_says_who_does_not_answer(ros, probe: Readine
     node = ros.add(Node("arm"))
     node.declare_parameter("speed.max", 1.0)
     spinning = threading.Event()
-    spinner = threading.Thread(target=lambda: ros.spin_until(spinning.is_set, timeout=60.0))
+    spinner = threading.Thread(target=lambda: ros.spin_until(spinning.is_set))
     spinner.start()
     try:
         assert "speed.max" in probe.parameters("arm")
@@ -116,7 +116,7 @@ def test_observer_keeps_tracks_states_and_resets_the_world(ros) -> None:
     world.status.publish(GraspStatus(state="IDLE", reason="waiting"))
     steps: list[Step] = []
     done = threading.Event()
-    spinner = threading.Thread(target=lambda: ros.spin_until(done.is_set, timeout=60.0))
+    spinner = threading.Thread(target=lambda: ros.spin_until(done.is_set))
     spinner.start()
     try:
         with Observer(int(os.environ["ROS_DOMAIN_ID"]), steps.append) as observer:

@@ -66,7 +66,7 @@ def test_the_topics_of_a_running_camera_are_perceived(ros, tmp_path):
             sender.publish(message)
         return not thread.is_alive()
 
-    ros.spin_until(ended, 60.0, "the command")
+    ros.spin_until(ended, what="the command")
     thread.join()
     (outcome,) = found
     check(outcome.data)

@@ -158,7 +158,7 @@ def killed_subscribers(ros) -> None:
         def opened_again() -> int:
             return sum(not (SHM / f"{name}_el").exists() for name in names_of(domain))
 
-        ros.spin_until(lambda: opened_again() == 2, 60.0, "the publisher has opened their ports again")
+        ros.spin_until(lambda: opened_again() == 2, what="the publisher has opened their ports again")
 
 
 @pytest.mark.long

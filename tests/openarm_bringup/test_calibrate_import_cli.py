@@ -44,16 +44,20 @@ def off(data: dict, known: files.Truth) -> tuple[float, float]:
     return mount_error(link @ T_LINK_OPTICAL, known.X)
 
 
-@pytest.mark.parametrize("kind", ["eye_in_hand", "eye_to_hand"])
 @pytest.mark.parametrize(
-    "writer", [files.easy_handeye2, files.moveit_yaml, files.moveit_json], ids=lambda w: w.__name__
+    ("writer", "name", "kind"),
+    [
+        (files.easy_handeye2, "demo.samples", "eye_in_hand"),
+        (files.moveit_yaml, "samples.yaml", "eye_to_hand"),
+        (files.moveit_json, "samples.json", "eye_in_hand"),
+    ],
+    ids=["easy_handeye2", "moveit_yaml", "moveit_json"],
 )
 @pytest.mark.requirement("P-28", "A-36")
-def test_pose_pairs_of_other_tools_are_solved_and_stored_by_one_command(capsys, tmp_path: Path, writer, kind) -> None:
+def test_pose_pairs_of_other_tools_are_solved_and_stored_by_one_command(
+    capsys, tmp_path: Path, writer, name: str, kind: str
+) -> None:
     known = files.truth("in_hand" if kind == "eye_in_hand" else "to_hand", 15, 2e-4, 4e-4)
-    name = {"easy_handeye2": "demo.samples", "moveit_yaml": "samples.yaml", "moveit_json": "samples.json"}[
-        writer.__name__
-    ]
     path = writer(tmp_path / name, known)
     code, out, err = run(capsys, str(path), "--camera-kind", kind, "--camera", "cam", "--save", "--json")
     assert code == 0, err

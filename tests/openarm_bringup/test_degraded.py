@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from openarm_bringup.supervision import runs
-from openarm_bringup.supervision.graph import NodeSpec, Ready, Restart
+from openarm_bringup.supervision.graph import Restart
 from openarm_bringup.supervision.keeper import NodeState
 from openarm_common.errors import OpenArmError
 
@@ -70,17 +70,5 @@ def test_a_node_that_can_be_spared_comes_back_when_what_it_lacked_is_there_again
             await run.until(lambda: run.seen("map")[-1] == NodeState.READY)
             (record,) = runs.running()
             assert record.health == "ready"
-
-    asyncio.run(body())
-
-
-def test_a_node_that_can_be_spared_still_has_to_come_up_once(tmp_path: Path) -> None:
-    command = ("python", "-c", "raise SystemExit('no such scene')")
-    broken = NodeSpec(command=command, ready=(Ready(service="/x"),), essential=False)
-
-    async def body() -> None:
-        async with running(tmp_path, {"broken": broken}) as run:
-            with pytest.raises(OpenArmError, match="no such scene"):
-                await run.supervisor.wait_ready()
 
     asyncio.run(body())

@@ -218,29 +218,10 @@ async def test_a_full_run_folder_holds_no_node_up_and_nothing_is_left_after_the_
     assert runs.running() == []
 
 
-@in_loop
-async def test_failed_node_comes_back_and_old_endpoints_do_not_count_as_ready(tmp_path: Path) -> None:
-    nodes = {"arm": toy(tmp_path, "arm", restart=Restart(backoff=0.05))}
-    async with running(tmp_path, nodes) as run:
-        await run.supervisor.wait_ready()
-        first = run.supervisor.pid("arm")
-        os.kill(first, signal.SIGKILL)
-        await run.until(lambda: run.seen("arm").count(NodeState.READY) == 2)
-        second = run.supervisor.pid("arm")
-        assert second != first
-        assert (tmp_path / "arm").read_text() == str(second)
-    assert run.seen("arm") == [
-        NodeState.STARTING,
-        NodeState.READY,
-        NodeState.BACKOFF,
-        NodeState.STARTING,
-        NodeState.READY,
-        NodeState.STOPPED,
-    ]
-
-
-def test_a_successor_does_not_get_the_ports_of_the_one_that_was_killed(tmp_path: Path) -> None:
-    """Others would go on writing into the shared memory that has their numbers."""
+def test_a_node_that_was_killed_comes_back_without_its_ports_and_old_endpoints_do_not_count_as_ready(
+    tmp_path: Path,
+) -> None:
+    """Others would go on writing into the shared memory that has the numbers of the ports."""
     take = """
 import itertools, socket, time
 for port in itertools.count(7400 + 250 * 67 + 10):
@@ -258,10 +239,13 @@ time.sleep(60)
     async def body() -> None:
         async with running(tmp_path, {"arm": spec.model_copy(update={"command": command})}) as run:
             await run.supervisor.wait_ready()
-            first = int(port.read_text())
-            os.kill(run.supervisor.pid("arm"), signal.SIGKILL)
+            first, killed = int(port.read_text()), run.supervisor.pid("arm")
+            os.kill(killed, signal.SIGKILL)
             await run.until(lambda: run.seen("arm").count(NodeState.READY) == 2)
+            assert (tmp_path / "arm").read_text() == str(run.supervisor.pid("arm")) != str(killed)
             assert int(port.read_text()) != first
+            back = [NodeState.STARTING, NodeState.READY]
+            assert run.seen("arm") == [*back, NodeState.BACKOFF, *back]
         with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as one:
             one.bind(("", first))  # released at the end
 
@@ -317,9 +301,10 @@ BROKEN = ("python", "-c", "raise SystemExit('no such scene')")
             "arm was not ready after 0.5 s; missing: action /pick",
         ),
         ({"command": BROKEN, "ready": (Ready(service="/x"),)}, "no such scene"),
+        ({"command": BROKEN, "ready": (Ready(service="/x"),), "essential": False}, "no such scene"),
         ({"params": {"sped": 1}}, "no parameter of arm 'sped'; did you mean speed?"),
     ],
-    ids=["never ready", "fails at its first start", "unknown parameter, which ROS would ignore"],
+    ids=["never ready", "fails at its first start", "could be spared", "unknown parameter, which ROS would ignore"],
 )
 @in_loop
 async def test_a_node_that_does_not_come_up_fails_the_graph(

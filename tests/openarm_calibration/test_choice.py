@@ -76,8 +76,8 @@ def test_no_closed_form_predicts_poses_that_were_left_out_better(kind: str, sets
 
 @pytest.mark.parametrize(
     ("translation", "rotation", "misfit_px"),
-    [(0.0, 0.0, 1.0), (1e-3, 2e-3, 0.0), (2e-3, 4e-3, 1.0), (4e-4, 8e-4, 0.0)],
-    ids=["boards", "robot", "both", "good robot"],
+    [(0.0, 0.0, 1.0), (2e-3, 4e-3, 1.0), (4e-4, 8e-4, 0.0)],
+    ids=["boards", "both", "good robot"],
 )
 def test_parts_of_the_noise_are_found_as_they_were_made(translation: float, rotation: float, misfit_px: float) -> None:
     """Rms over four sets of 25 views: positions and misfit within a fifth of the truth, rotations within two."""

@@ -231,13 +231,6 @@ def test_joint_positions_in_degrees_are_named(session) -> None:
         solve(wrong.problem())
 
 
-def test_an_unknown_link_in_a_session_lists_the_links(session) -> None:
-    known = session(count=3)
-    head = known.samples.head.model_copy(update={"carrier": "nowhere"})
-    with pytest.raises(OpenArmError, match=r"no link 'nowhere'; links: .*openarm_right_link7"):
-        type(known.samples)(head, known.description)
-
-
 def _archive(path: Path, **members: bytes) -> Path:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in members.items():

@@ -80,11 +80,11 @@ def model(description: RobotDescription) -> mujoco.MjModel:
 
 @pytest.fixture(scope="module")
 def configurations(description: RobotDescription) -> list[dict[str, float]]:
-    """200 random configurations within the limits, by joint name."""
+    """60 random configurations within the limits, by joint name."""
     rng = np.random.default_rng(7)
     names = [name for name, joint in description.joints.items() if joint.type != "fixed" and joint.mimic is None]
     lower, upper = description.limits(names)
-    return [dict(zip(names, rng.uniform(lower, upper), strict=True)) for _ in range(200)]
+    return [dict(zip(names, rng.uniform(lower, upper), strict=True)) for _ in range(60)]
 
 
 def expected(description: RobotDescription, q: dict[str, float]) -> dict[str, Array]:

@@ -86,7 +86,7 @@ def test_planes_up_to_the_slant_are_left_alone(slant: float) -> None:
         assert not (flying(depth) & whole)[inside].any()
 
 
-@pytest.mark.parametrize("gap", [0.15, 0.3, 1.0])
+@pytest.mark.parametrize("gap", [0.15, 1.0])
 @pytest.mark.requirement("A-51", "A-52")
 def test_what_floats_between_two_surfaces_is_found(gap: float) -> None:
     """A disc before a wall, as a D435 sees it: what is left lies at the disc or at the wall."""

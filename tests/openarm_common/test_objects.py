@@ -198,7 +198,7 @@ def test_facets_of_what_is_round_are_one_side() -> None:
     assert cylinder is not None
     sides = resting_sides([cylinder])
     assert [round(side.height, 3) for side in sides] == [0.03, 0.05, 0.05]
-    ball = hull_part(Superquadric((0.03, 0.03, 0.03), 1.0, 1.0).points())
+    ball = hull_part(Superquadric((0.03, 0.03, 0.03), 1.0, 1.0).points(16, 32))
     assert ball is not None
     assert len(resting_sides([ball])) == 1
 

@@ -39,15 +39,6 @@ def altered(mine: Path, **changes: object) -> None:
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | changes))
 
 
-def test_a_robot_of_another_name_is_read_from_its_folder(robots, monkeypatch):
-    assert folder.robot_names() == ("mine",)
-    monkeypatch.setenv(folder.ROBOT, "mine")
-    robot = RobotDescription.load()
-    assert robot.name == "mine"
-    assert robot.arm_names == ("left", "right")
-    assert robot is RobotDescription.load("mine")
-
-
 def test_a_robot_that_is_not_there_is_refused_with_those_that_are(robots):
     with pytest.raises(OpenArmError, match="no robot 'other'; robots: mine") as error:
         RobotDescription.from_folder("other")

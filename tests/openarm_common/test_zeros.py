@@ -24,7 +24,7 @@ angles = st.lists(st.floats(-0.1, 0.1), min_size=len(JOINTS), max_size=len(JOINT
 
 
 @pytest.mark.requirement("R-11")
-@settings(max_examples=12)
+@settings(max_examples=5)
 @given(angles, st.integers(0, 1000))
 def test_a_calibrated_robot_that_reports_q_is_where_the_described_one_is_at_q_plus_its_zeros(
     values: list[float], seed: int

@@ -76,13 +76,6 @@ def test_a_trajectory_is_followed_to_its_goal() -> None:
     assert not arm.follower.busy
 
 
-def test_joint_order_of_the_goal_does_not_matter() -> None:
-    arm = Arm()
-    arm.start(names=("j2", "j1"))
-    arm.run()
-    np.testing.assert_allclose(arm.q, [-0.5, 0.5])
-
-
 def test_the_way_to_the_first_point_starts_at_the_present_command() -> None:
     arm = Arm()
     arm.start(t=np.array([0.5, 1.0]), q=np.array([[0.2, 0.2], [0.4, 0.4]]), v=np.array([[0.4, 0.4], [0.0, 0.0]]))
@@ -236,15 +229,6 @@ def test_trajectories_that_replace_each_other_keep_the_velocity_of_the_reference
     arm.follower.abort("the end")
     arm.tick()
     np.testing.assert_array_equal(arm.follower.state.desired_velocity, 0.0)
-
-
-def test_a_refused_trajectory_leaves_the_running_one_alone() -> None:
-    arm = Arm()
-    arm.start(**CUBIC)
-    arm.tick(10)
-    with pytest.raises(TrajectoryError):
-        arm.start(start_ns=1)
-    assert arm.run().end is End.SUCCEEDED
 
 
 @pytest.mark.requirement("P-21")

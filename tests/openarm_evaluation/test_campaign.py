@@ -209,6 +209,7 @@ def test_heavy_soft_late_arms_with_wrong_zeros_are_identified_and_place_an_objec
     assert "--dynamics-seeds 41" in row["again"]
 
 
+@pytest.mark.long
 @pytest.mark.requirement("B-01", "B-70", "R-18")
 def test_two_objects_are_placed_one_after_the_other_without_a_reset(tmp_path) -> None:
     """Asked for by shape, and by colour and shape; each is judged as the object that the words mean."""

@@ -15,7 +15,6 @@ from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, ArmClearance, least_clearance, watch_clearance
 from openarm_grasp.config import GraspConfig
-from openarm_motion.collision.occupancy import OccupancyMap
 from openarm_motion.service.requests import ExecuteRequest, MotionAnswer
 from openarm_motion.timing.trajectory import Motion
 
@@ -111,24 +110,6 @@ def sweep(robot: SimRobot, x: float = 0.27) -> dict[str, Motion]:
     return motions
 
 
-def test_an_arm_next_to_one_under_way_starts_later_and_keeps_clear() -> None:
-    robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
-    gap, motions = watch_clearance(robot), sweep(robot)
-    answers: dict[str, MotionAnswer] = {}
-
-    def part(arm: str, delay: float):
-        async def run() -> None:
-            answers[arm] = await robot.motion.execute(ExecuteRequest(arm, motions[arm], delay))
-
-        return run
-
-    carry_out(robot, robot.together([part("left", 20.0), part("right", 20.0)]))
-    assert [answer.code for answer in answers.values()] == [Code.OK, Code.OK]
-    assert answers["left"].start_delay == 0.0
-    assert 0.5 < answers["right"].start_delay < 4.0  # it comes when the left arm is about to be gone
-    assert gap.least >= LEAST_CLEARANCE
-
-
 def test_an_arm_that_may_not_wait_long_enough_is_refused_and_one_whose_way_is_blocked_holds() -> None:
     robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
     gap, motions = watch_clearance(robot), sweep(robot)
@@ -151,19 +132,6 @@ def test_an_arm_that_may_not_wait_long_enough_is_refused_and_one_whose_way_is_bl
     assert answers["right"].code is Code.IN_COLLISION
     assert "the left arm stopped on its way" in answers["right"].message
     assert gap.least >= LEAST_CLEARANCE
-
-
-def test_plans_in_process_see_the_map_of_the_rendered_images() -> None:
-    robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
-    robot.pass_time(0.1)
-    state = robot.motion.scene_state()
-    assert state.map.occupied is not None, state.map.why
-    cells = OccupancyMap.of(robot.map.latest()).centres
-    for item in robot.scene.objects:  # each object is in it, and hardly anything else above the table
-        assert np.min(np.linalg.norm(cells - item.centre(robot.scene.table), axis=1)) < 0.06
-    assert cells[:, 2].max() < robot.scene.table.top_z + 0.15
-    robot.pass_time(0.5)
-    assert robot.motion.scene_state().map.version == state.map.version + 1
 
 
 def test_parameters_of_nodes_hold_in_process() -> None:

@@ -15,6 +15,8 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 
+pytestmark = [pytest.mark.long, pytest.mark.requirement("A-01")]
+
 
 def grasp(*sets: str, calibrated: bool = True) -> tuple[dict[str, Any], float]:
     """The row of the grasp at mount seed 1, and how far the screen was pushed, m."""
@@ -28,7 +30,6 @@ def grasp(*sets: str, calibrated: bool = True) -> tuple[dict[str, Any], float]:
     return row, max(float(np.linalg.norm(sample.p_world - screen[0].p_world)) for sample in screen)
 
 
-@pytest.mark.requirement("A-01")
 def test_with_calibration_and_map_the_box_is_placed_within_5_mm_and_the_screen_is_not_touched() -> None:
     row, pushed = grasp()
     assert row["placed"], row["message"]
@@ -36,8 +37,6 @@ def test_with_calibration_and_map_the_box_is_placed_within_5_mm_and_the_screen_i
     assert pushed < 0.001
 
 
-@pytest.mark.long
-@pytest.mark.requirement("A-01")
 def test_without_calibration_the_grasp_fails_and_says_so() -> None:
     row, _ = grasp(calibrated=False)
     assert not row["placed"]
@@ -45,8 +44,6 @@ def test_without_calibration_the_grasp_fails_and_says_so() -> None:
     assert row["reasons"]  # of the judge: never lifted, dropped, or tilted, by where the fingers happen to touch it
 
 
-@pytest.mark.long
-@pytest.mark.requirement("A-01")
 def test_without_the_map_the_arm_runs_into_the_screen() -> None:
     row, pushed = grasp("motion.map.use=off")
     assert not row["placed"]

@@ -110,11 +110,6 @@ def test_what_a_solver_rocks_by_hundredths_of_a_millimetre_is_at_rest_and_what_t
     assert not rests(turning[:1])
 
 
-def test_at_rest_looks_at_both_velocities() -> None:
-    assert at_rest(sample(0, 0, 0, 0, speed=0.001))
-    assert not at_rest(sample(0, 0, 0, 0, speed=0.01))
-
-
 def test_no_target_is_never_met() -> None:
     verdict = judge(good_track(), (math.nan, math.nan), claimed=False)
     assert not verdict.placed

@@ -33,6 +33,8 @@ def test_the_robot_in_process_has_the_motion_service_and_a_map_that_shows_the_ob
     assert np.asarray(field.at(tops)).max() < 0.03
     assert field.at([(0.3, 0.0, scene.table.top_z + 0.25)])[0] > 0.05  # nothing is in the air
     field.require_fresh(robot.t_ns, 2.0)
+    seen = robot.motion.scene_state().map
+    assert seen.occupied is not None, seen.why  # it plans with that map
 
 
 @pytest.mark.requirement("B-63", "R-15")

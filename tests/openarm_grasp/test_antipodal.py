@@ -24,7 +24,7 @@ def tilted(parts, yaw, x, y):
     return [se3.apply(T, part) for part in parts], T
 
 
-@settings(max_examples=3, phases=(Phase.explicit, Phase.generate))
+@settings(max_examples=2, phases=(Phase.explicit, Phase.generate))
 @given(yaw=st.floats(-3.1, 3.1), x=st.floats(-0.05, 0.05), y=st.floats(-0.05, 0.05))
 def test_an_object_turned_and_moved_gives_the_grasps_turned_and_moved(yaw, x, y):
     part = box((0.035, 0.11, 0.06))
@@ -40,7 +40,7 @@ def test_an_object_turned_and_moved_gives_the_grasps_turned_and_moved(yaw, x, y)
     assert first.score == pytest.approx(second.score, abs=0.6)
 
 
-@settings(max_examples=4, phases=(Phase.explicit, Phase.generate))
+@settings(max_examples=3, phases=(Phase.explicit, Phase.generate))
 @given(
     size=st.tuples(*[st.floats(0.015, 0.12)] * 3),
     yaw=st.floats(-1.5, 1.5),
@@ -129,11 +129,8 @@ def test_a_shadow_of_something_else_is_no_place_for_the_hand():
         assert (deep > 0.004).sum() <= 0.002 * len(hidden)
 
 
-@pytest.mark.parametrize("robot", ["openarm_v1", "openarm_v2"])
-def test_the_hands_of_both_robots_hold_a_block(robot):
-    arm = "right"
-    shape = hand(robot, arm)
-    best = grasps(surface_of([box((0.04, 0.08, 0.05), yaw=0.5)]), shape)[0]
+def test_the_hand_of_openarm_v2_holds_a_block():
+    best = grasps(surface_of([box((0.04, 0.08, 0.05), yaw=0.5)]), hand("openarm_v2", "right"))[0]
     assert best.apertures[0] <= 0.04 <= best.apertures[1]
     y = np.array([np.cos(0.5), np.sin(0.5), 0.0])
     assert abs(float(best.T_base_tcp[:3, 1] @ y)) > 0.985

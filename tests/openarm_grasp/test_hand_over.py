@@ -49,16 +49,6 @@ def test_an_object_goes_from_hand_to_hand_by_way_of_the_middle(robot) -> None:
 
 
 @pytest.mark.requirement("P-12")
-def test_what_the_taker_cannot_use_is_not_chosen(robot) -> None:
-    """The taker reaches one end of the strip only; nothing moves before a spot there is found."""
-    two = robot(0.25, -0.30, hand_over={"tries": 50})
-    two.reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= 0.02
-    outcome = two.ask(place=(0.25, 0.30))
-    assert outcome.route == "hand_over"
-    assert len([e for e in two.done(Follow) if e.trajectory == "lift"]) == 2
-
-
-@pytest.mark.requirement("P-12")
 def test_a_taker_that_fails_leaves_a_partial_result_that_says_where_the_object_is(robot) -> None:
     two = robot(0.25, -0.30)
     two.fail(lambda e: isinstance(e, Follow) and e.arm == "left" and e.trajectory == "approach",

@@ -118,10 +118,6 @@ def test_nothing_is_pushed_aside_for_an_order_of_something_particular():
     assert heap.aside == []
 
 
-def test_of_all_that_fits_the_easiest_is_asked_for():
-    assert Order(("red",)).next() == GraspRequest("easiest red")
-
-
 def test_a_label_that_fails_in_vain_again_and_again_is_given_up():
     order, asked = Order(("anything",)), 0
     while ask := order.next():

@@ -240,6 +240,7 @@ def test_a_command_that_is_old_when_it_comes_is_not_followed() -> None:
     for _ in range(100):
         bench.command = Command(bench.now_ns - int(2e9 * bench.settings.stale_s), away)
         bench.tick()
+    assert bench.phases == UP, bench.machine.text
     assert bench.q() == pytest.approx(before, abs=0.002)
 
 

@@ -111,7 +111,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     found.close()
 
 
-def test_a_servo_has_one_thread_holds_stops_and_ends_with_motors_that_are_off(rig: Rig) -> None:
+def test_a_servo_has_one_thread_holds_says_what_stopped_it_and_ends_with_motors_that_are_off(rig: Rig) -> None:
     servo = rig.up()
     assert len(os.listdir(f"/proc/{servo.pid}/task")) == 1
     before = rig.ask()
@@ -120,6 +120,11 @@ def test_a_servo_has_one_thread_holds_stops_and_ends_with_motors_that_are_off(ri
     servo.stop()
     state = rig.until(servo, lambda state: state.phases == (Phase.HELD, Phase.HELD))
     assert "emergency stop" in state.text
+    servo.reset()
+    rig.until(servo, lambda state: state.phases == UP)
+    servo.stop("one_4 is commanded to touch two_4;\nno line of its own")
+    state = rig.until(servo, lambda state: state.phases == (Phase.HELD, Phase.HELD))
+    assert state.text == "one_4 is commanded to touch two_4; no line of its own"
     servo.reset()
     state = rig.until(servo, lambda state: state.phases == UP and sum(state.periods) > 20)
     after = rig.ask()
@@ -217,15 +222,3 @@ def test_a_scan_lists_the_motors_that_answer_and_switches_none_on(rig: Rig) -> N
     assert first.q == pytest.approx(0.3, abs=0.001)
     assert (finger.id, finger.celsius, finger.firmware) == (8, 35, 5015)
     assert not any(rig.ask()[axis.joint]["on"] for axis in rig.axes)
-
-
-def test_a_stop_holds_both_arms_and_says_why_until_it_is_reset(rig: Rig) -> None:
-    servo = rig.up()
-    servo.stop("one_4 is commanded to touch two_4;\nno line of its own")
-    state = rig.until(servo, lambda state: state.phases == (Phase.HELD, Phase.HELD))
-    assert state.text == "one_4 is commanded to touch two_4; no line of its own"
-    servo.reset()
-    rig.until(servo, lambda state: state.phases == UP)
-    servo.stop()
-    state = rig.until(servo, lambda state: state.phases == (Phase.HELD, Phase.HELD))
-    assert "emergency stop" in state.text

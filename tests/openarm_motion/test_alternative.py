@@ -69,6 +69,7 @@ def test_a_start_in_collision_names_the_pair(right: Arm, home: dict[str, float])
     with pytest.raises(PlanFailedError) as caught:
         moves.to_joints(right, now, now.start.tolist(), around)
     assert (caught.value.stage, caught.value.code) == ("start", Code.IN_COLLISION)
+    assert "starts in collision" in caught.value.message
     assert caught.value.contact is not None
     assert caught.value.contact.second == "brick"
 

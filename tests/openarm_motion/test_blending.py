@@ -42,13 +42,17 @@ def in_box(trajectory: Trajectory, waypoints: np.ndarray) -> bool:
 
 
 @pytest.mark.requirement("R-31")
-@pytest.mark.parametrize("sides", [("right",), ("left", "right")])
-@given(data=st.data(), scale=st.sampled_from([0.1, 0.5, 1.0]), how=st.sampled_from(["blended", "stops", "quintic"]))
+@given(
+    data=st.data(),
+    sides=st.sampled_from([("right",), ("left", "right")]),
+    scale=st.sampled_from([0.1, 0.5, 1.0]),
+    how=st.sampled_from(["blended", "stops", "quintic"]),
+)
 @settings(max_examples=12)
 def test_limits_hold_everywhere_for_one_arm_and_both(
     arms: dict[str, Arm],
-    sides: tuple[str, ...],
     data: st.DataObject,
+    sides: tuple[str, ...],
     scale: float,
     how: Literal["blended", "stops", "quintic"],
 ) -> None:

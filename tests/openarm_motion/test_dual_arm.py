@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -165,31 +164,3 @@ def test_separation_is_the_least_of_all_pairs(both, home) -> None:
         else:
             assert scene.separation(q) >= 0.1
     assert near > 8
-
-
-@pytest.mark.requirement("N-12")
-def test_corners_of_both_arms_are_rounded_and_keep_apart(both, home) -> None:
-    posts = [box_from(f"post{i}", (0.36, y, 0.65), (0.03, 0.03, 0.5)) for i, y in enumerate((-0.42, -0.2, 0.2))]
-    scene = both.scene(home, posts)
-    rng = np.random.default_rng(35)
-    free = (q for q in rng.uniform(both.lower, both.upper, (1500, 14)) if not scene.collides(q))
-    states = itertools.islice(free, 14)
-    for a, b in itertools.pairwise(states):
-        state = {**home, **dict(zip(both.names, a.tolist(), strict=True))}
-        first, second = both.parts(b)
-        plan = plan_together(both, StartState(state, a, 0.5), DualArmGoals((first[None], second[None]), posts), 5.0)
-        whole = joined(both, plan.trajectories)
-        assert np.all(np.abs(whole.v) <= both.limits(0.5).velocity * (1 + 1e-6))
-        moving = np.abs(whole.v).max(axis=1)[1:-1] > 1e-6
-        if turns(whole) and moving.all():  # it does not stop where it turns
-            assert plan.clearance >= 0.020
-            assert apart_all_the_way(both, state, plan) >= 0.020
-            return
-    pytest.fail("every plan with a corner stops in it")
-
-
-def turns(whole) -> int:
-    """How often the motion changes its direction in joint space by more than 20 degrees."""
-    fast = whole.v[np.abs(whole.v).max(axis=1) > 1e-3]
-    d = fast / np.linalg.norm(fast, axis=1, keepdims=True)
-    return int(np.sum(np.arccos(np.clip(np.sum(d[:-5] * d[5:], axis=1), -1, 1)) > np.radians(20)))

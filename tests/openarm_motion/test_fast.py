@@ -14,12 +14,8 @@ from benchmarks.robot_models import ROBOTS, load_arm
 from openarm_common import se3
 from openarm_common.collision import shape_kernels as kernels
 from openarm_common.errors import OpenArmError
-from openarm_common.robot.description import RobotDescription
-from openarm_motion.collision.exact import CollisionContext, CollisionScene
 from openarm_motion.collision.fast import DistanceMap, FastScene, cover
-from openarm_motion.collision.robot import CollisionRobot
 from openarm_motion.collision.solids import Box, box_from
-from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.dual_arm import DualArm
 from tests.openarm_motion.conftest import both_layers
@@ -66,21 +62,6 @@ def test_both_arms_never_free_where_they_meet(arms: dict[str, Arm], home: dict[s
     assert free > 0.9 * truth > 30
 
 
-def test_edges_agree_with_the_exact_layer(right: Arm, home: dict[str, float]) -> None:
-    rng = np.random.default_rng(5)
-    exact = right.scene(home, turned_boxes(rng, 3))
-    fast = FastScene([exact])
-    states = rng.uniform(right.kinematics.lower, right.kinematics.upper, (400, 7))
-    states = states[fast.free_many(states)]
-    free = 0
-    for a in states:
-        b = np.clip(a + rng.normal(0.0, 0.2, 7), right.kinematics.lower, right.kinematics.upper)
-        if fast.edge_free(a, b, 0.05, 0.02):
-            assert exact.edge_free(a, b, 0.05, 0.02)
-            free += 1
-    assert free > 10
-
-
 def test_a_thin_wall_is_not_jumped_over(right: Arm, home: dict[str, float]) -> None:
     """The hand on one side of a sheet of 1 mm, and on the other: steps are short enough to meet it."""
     poses = [se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.32, y, 0.62)) for y in (-0.32, -0.10)]
@@ -112,16 +93,6 @@ def test_cells_of_a_map_are_never_overlooked(right: Arm, home: dict[str, float])
     free, truth = both_layers(fast, exact, states)
     assert 10 < free < int(np.sum(FastScene([right.scene(home)]).free_many(states)))
     assert free > 0.9 * truth  # the balls about the shapes don't have the last word
-
-
-def test_a_cell_at_the_gripper_is_seen(right: Arm, home: dict[str, float]) -> None:
-    q = np.array([home[name] for name in right.names])
-    cells = np.zeros((50, 80, 50), np.bool_)
-    far = FastScene([right.scene(home)], map_of(cells, 0.15))
-    assert far.free(q)
-    p = right.kinematics.fk(q)[:3, 3]
-    cells[tuple(np.floor((p - [-0.2, -0.8, 0.2]) / 0.02).astype(int))] = True
-    assert not FastScene([right.scene(home)], map_of(cells, 0.15)).free(q)
 
 
 def test_a_map_that_does_not_reach_far_enough_is_refused(right: Arm, home: dict[str, float]) -> None:
@@ -160,16 +131,6 @@ def test_hands_of_other_robots_are_never_too_free(name: str, share: float) -> No
     states = np.random.default_rng(14).uniform(arm.kinematics.lower, arm.kinematics.upper, (1000, arm.kinematics.n))
     free, truth = both_layers(FastScene([exact]), exact, states)
     assert free > 0.9 * truth > 250
-
-
-@pytest.mark.requirement("B-13")
-def test_another_robot_goes_through_the_same_code(six: RobotDescription) -> None:
-    robot = CollisionRobot(six, ArmKinematics(six, "tool"))
-    rng = np.random.default_rng(13)
-    exact = CollisionScene(robot, CollisionContext({}, turned_boxes(rng, 4)))
-    states = rng.uniform(robot.kinematics.lower, robot.kinematics.upper, (2000, 6))
-    free, truth = both_layers(FastScene([exact]), exact, states)
-    assert free > 0.9 * truth > 100
 
 
 def test_what_a_line_leaves_out_is_free_in_all_its_states(arms: dict[str, Arm], home: dict[str, float]) -> None:

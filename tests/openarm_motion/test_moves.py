@@ -71,24 +71,6 @@ def test_to_a_pose_in_the_nearest_configuration(right: Arm, home: dict[str, floa
     assert np.max(np.abs(trajectory.q[-1] - now.start)) < 1.3
 
 
-def test_straight_down_from_home_and_back(right: Arm, home: dict[str, float]) -> None:
-    now = right.start_state(home)
-    T = right.kinematics.fk(now.start)
-    goal = T.copy()
-    goal[2, 3] -= 0.12
-    trajectory = moves.to_pose_on_line(right, now, goal, NOTHING)
-    tool = right.kinematics.fk_many(trajectory.q)[:, :3, 3]
-    np.testing.assert_allclose(tool[:, :2], np.tile(T[:2, 3], (len(tool), 1)), atol=1e-5)
-    far = T.copy()
-    far[0, 3] += 0.6
-    message = refused(Code.UNREACHABLE, moves.to_pose_on_line, right, now, far, NOTHING)
-    assert message.startswith("right arm: the straight line of 600 mm ends after")
-    post = Box("post", T @ se3.make(None, (0.0, 0.0, 0.06)), np.array([0.03, 0.03, 0.03]))
-    forward = T @ se3.make(None, (0.0, 0.0, 0.08))
-    message = refused(Code.IN_COLLISION, moves.to_pose_on_line, right, now, forward, RequestBoxes([post]))
-    assert "post" in message
-
-
 @pytest.mark.requirement("B-47")
 def test_a_line_may_pass_by_an_object_nearer_than_a_free_path(right: Arm, home: dict[str, float]) -> None:
     state = right.with_gripper(home, 0.044)
@@ -116,14 +98,6 @@ def test_goals_that_collide_or_break_limits_are_refused_by_name(right: Arm, home
     message = refused(Code.IN_COLLISION, moves.to_pose, right, now, pose, NOTHING)
     assert "table" in message
     assert "configurations collide" in message
-
-
-def test_a_start_that_is_stuck_is_refused(right: Arm, home: dict[str, float]) -> None:
-    now = right.start_state(home)
-    block = Box("block", right.kinematics.fk(now.start), np.array([0.1, 0.1, 0.1]))
-    message = refused(Code.IN_COLLISION, moves.to_named, right, now, "home", RequestBoxes([block]))
-    assert "starts in collision" in message
-    assert "block" in message
 
 
 def test_start_states_are_checked(right: Arm, home: dict[str, float]) -> None:

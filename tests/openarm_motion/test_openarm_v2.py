@@ -8,12 +8,10 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
-from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.solids import box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.moves import RequestBoxes, to_pose
-from tests.openarm_motion.conftest import both_layers
 
 TABLE = box_from("table", (0.46, 0.0, 0.43), (0.7, 1.2, 0.04))  # its top is at 0.45 m
 
@@ -23,9 +21,9 @@ def robot() -> RobotDescription:
     return RobotDescription.load("openarm_v2")
 
 
-@pytest.fixture(scope="module", params=["left", "right"])
-def arm(request: pytest.FixtureRequest, robot: RobotDescription) -> Arm:
-    return Arm(request.param, robot, MotionConfig(), [TABLE])
+@pytest.fixture(scope="module")
+def arm(robot: RobotDescription) -> Arm:
+    return Arm("left", robot, MotionConfig(), [TABLE])
 
 
 @pytest.mark.requirement("B-13")
@@ -54,18 +52,9 @@ def test_a_pose_over_a_table_is_planned_from_home(arm):
     home = {**robot.group_state("both_arms", "home"), **{robot.finger_joint(side): 0.0 for side in robot.arms}}
     start = np.array([home[name] for name in arm.names])
     assert not arm.scene(home).collides(start)
-    y = 0.2 if arm.name == "left" else -0.2
-    target = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.25, y, 0.55))
+    target = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.25, 0.2, 0.55))
     trajectory = to_pose(arm, StartState(home, start), target, RequestBoxes())
     np.testing.assert_allclose(arm.kinematics.fk(trajectory.q[-1]), target, atol=1e-3)
-
-
-@pytest.mark.requirement("B-13")
-def test_the_fast_layer_is_never_more_generous(arm):
-    exact = arm.scene({})
-    states = np.random.default_rng(4).uniform(arm.kinematics.lower, arm.kinematics.upper, (400, 7))
-    free, truth = both_layers(FastScene([exact]), exact, states)
-    assert free > 0.9 * truth > 30
 
 
 def _pad(robot: RobotDescription, finger: str) -> np.ndarray:

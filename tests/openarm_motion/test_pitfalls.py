@@ -28,27 +28,22 @@ def overlaps(arm: Arm, state: dict[str, float], plan: Trajectory, boxes=()) -> l
 
 
 @pytest.mark.requirement("A-68")
-def test_no_path_leads_through_the_chest(arms: dict[str, Arm], home: dict[str, float]) -> None:
-    """Starts and goals whose straight joint line goes through the body or the other arm."""
-    rng = np.random.default_rng(68)
-    for arm in arms.values():
-        scene = arm.scene(home)
-        own = scene.robot.arm.moving
-        while True:
-            a, b = rng.uniform(arm.kinematics.lower, arm.kinematics.upper, (2, arm.kinematics.n))
-            if scene.collides(a) or scene.collides(b):
-                continue
-            hit = scene.first_hit(a, b)
-            if hit is None or scene.contacts(hit)[0].second in own | {"table"}:
-                continue
-            plan = moves.to_joints(arm, arm.start_state(home, a.tolist(), 1.0), b.tolist(), RequestBoxes())
-            assert overlaps(arm, home, plan) == []
+def test_no_path_leads_through_the_chest(right: Arm, home: dict[str, float]) -> None:
+    """Start and goal whose straight joint line goes through the body or the other arm."""
+    rng, scene = np.random.default_rng(68), right.scene(home)
+    while True:
+        a, b = rng.uniform(right.kinematics.lower, right.kinematics.upper, (2, right.kinematics.n))
+        if scene.collides(a) or scene.collides(b):
+            continue
+        hit = scene.first_hit(a, b)
+        if hit is not None and scene.contacts(hit)[0].second not in scene.robot.arm.moving | {"table"}:
             break
+    plan = moves.to_joints(right, right.start_state(home, a.tolist(), 1.0), b.tolist(), RequestBoxes())
+    assert overlaps(right, home, plan) == []
 
 
-@pytest.mark.parametrize("thickness", [0.001, 0.0002])
-def test_a_plan_does_not_tunnel_through_a_thin_wall(thickness: float, right: Arm, home: dict[str, float]) -> None:
-    wall = box_from("sheet", (0.32, -0.21, 0.60), (0.24, thickness, 0.36))
+def test_a_plan_does_not_tunnel_through_a_thin_wall(right: Arm, home: dict[str, float]) -> None:
+    wall = box_from("sheet", (0.32, -0.21, 0.60), (0.24, 0.0002, 0.36))
     walled = right.scene(home, [wall])
     poses = [se3.make(DOWN, (0.32, y, 0.62)) for y in (-0.34, -0.08)]
     a, b = (next(s.q for s in right.inverse.solutions(p, 0.05) if not walled.collides(s.q)) for p in poses)

@@ -53,39 +53,13 @@ def test_from_hanging_zero_to_home_and_back_around_table_and_chest(right: Arm, h
         np.testing.assert_array_equal(path.waypoints[[0, -1]], [start, goal])
 
 
-@pytest.mark.requirement("A-68")
-def test_adversarial_pairs_never_go_through_the_robot(arms: dict[str, Arm], home: dict[str, float]) -> None:
-    # from one side of the robot's column to the other, the other arm reaching into the way
-    left, right = arms["left"], arms["right"]
-    reach = left.inverse.solutions(_down(0.26, 0.06, 0.60), 0.05)
-    in_the_way = next(s.q for s in reach if not left.scene(home).collides(s.q))
-    state = {**home, **dict(zip(left.names, in_the_way.tolist(), strict=True))}
-    scene = right.scene(state)
-    rng = np.random.default_rng(68)
-    arm = right.kinematics
-    solved = 0
-    starts = [q for q in rng.uniform(arm.lower, arm.upper, (300, 7)) if not scene.collides(q)]
-    for start, goal in zip(starts[:-1:2], starts[1::2], strict=False):
-        if scene.edge_free(start, goal):
-            continue
-        path = OmplPlanner().plan(query(right, scene, start, goal, time_limit=5.0))
-        assert_free(right, state, path)
-        solved += 1
-        if solved == 6:
-            break
-    assert solved >= 6
-
-
-def _down(x: float, y: float, z: float) -> np.ndarray:
-    return se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (x, y, z))
-
-
-def to_pre_grasps(right: Arm, home: dict[str, float], count: int) -> list[float]:
-    """Plan from home to random pre-grasps; returns what each search took, s of this thread."""
+@pytest.mark.long
+def test_home_to_fifty_pre_grasps_is_quick(right: Arm, home: dict[str, float]) -> None:
+    """By the time of this thread."""
     scene, start = right.scene(home), q_of(right, home)
     rng = np.random.default_rng(0)
     took: list[float] = []
-    while len(took) < count:
+    while len(took) < 50:
         yaw = rng.uniform(-np.pi, np.pi)
         R = se3.rotation_from_z_y((0, 0, -1), (np.cos(yaw), np.sin(yaw), 0))
         pose = se3.make(R, (rng.uniform(0.16, 0.36), -rng.uniform(0.06, 0.42), 0.53))
@@ -96,16 +70,7 @@ def to_pre_grasps(right: Arm, home: dict[str, float], count: int) -> list[float]
         path = OmplPlanner().plan(query(right, scene, start, np.array(goals)))
         took.append(time.thread_time() - begin)
         np.testing.assert_array_equal(path.waypoints[-1], goals[path.goal])
-    return took
-
-
-def test_from_home_to_pre_grasps_there_is_a_path(right: Arm, home: dict[str, float]) -> None:
-    to_pre_grasps(right, home, 10)
-
-
-@pytest.mark.long
-def test_home_to_fifty_pre_grasps_is_quick(right: Arm, home: dict[str, float]) -> None:
-    assert np.median(to_pre_grasps(right, home, 50)) < 0.3
+    assert np.median(took) < 0.3
 
 
 def test_the_first_of_several_goals_is_preferred(right: Arm, home: dict[str, float]) -> None:

@@ -128,10 +128,8 @@ def test_both_arms_jogged_at_random_among_bodies_touch_nothing(arms, home, seed,
     assert all(np.ptp(track, axis=0).max() > 0.3 for track in bench.tracks.values())  # they did move
 
 
-@pytest.mark.parametrize("held", [False, True])
-def test_at_full_speed_towards_the_table_an_arm_slows_and_stops_over_it(arms, home, table, held):
-    boxes = (box_from("cube", (0.0, 0.0, 0.05), (0.05, 0.05, 0.15)),) if held else ()
-    bench = Bench(arms, home, held={"left": (), "right": boxes})
+def test_at_full_speed_towards_the_table_an_arm_slows_and_what_it_holds_stops_over_it(arms, home, table):
+    bench = Bench(arms, home, held={"left": (), "right": (box_from("cube", (0.0, 0.0, 0.05), (0.05, 0.05, 0.15)),)})
     top = table.T[2, 3] + 0.5 * table.size[2]
 
     for _ in range(300):

@@ -37,7 +37,7 @@ def assert_within_limits(trajectory: Trajectory, limits: JointLimits) -> None:
     np.testing.assert_allclose(np.diff(v, axis=0) / h, 0.5 * (a[1:] + a[:-1]), atol=0.05)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(
     st.lists(st.lists(st.floats(-1.5, 1.5), min_size=7, max_size=7), min_size=2, max_size=4),
     st.floats(0.1, 1.0),

@@ -102,7 +102,7 @@ def test_the_scene_asks_for_its_full_clearance_again_afterwards(right: Arm, home
     path = across(right, home)
     p = right.kinematics.fk(path.waypoints[0])[:3, 3]
     sides = [(p[0], p[1], p[2] - 0.05 - gap) for gap in np.linspace(-0.04, 0.03, 71)]
-    near = [right.scene(home, [box_from("block", c, (0.3, 0.3, 0.05))]) for c in sides]
+    near = (right.scene(home, [box_from("block", c, (0.3, 0.3, 0.05))]) for c in sides)
     scene = next(s for s in near if s.collides(path.waypoints[0]) and s.contacts(path.waypoints[0])[0].distance > 0.006)
     with scene.lenient(0.5):
         assert not scene.collides(path.waypoints[0])

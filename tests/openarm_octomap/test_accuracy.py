@@ -63,11 +63,10 @@ def test_compare_counts_what_it_says() -> None:
     assert worse.iou == pytest.approx(3 / 5)
 
 
-@pytest.mark.parametrize("noisy", [False, True])
 @pytest.mark.requirement("N-10", "A-46")
-def test_the_map_is_the_visible_geometry(scene: MapScene, truth: Visible, noisy: bool) -> None:
-    """Both cameras, clean and as noisy as a D435: no ghost, hardly anything missed, the robot itself not in it."""
-    target, rng = mapper(scene), np.random.default_rng(1) if noisy else None
+def test_the_map_is_the_visible_geometry(scene: MapScene, truth: Visible) -> None:
+    """Both cameras, as noisy as a D435: no ghost, hardly anything missed, the robot itself not in it."""
+    target, rng = mapper(scene), np.random.default_rng(1)
     for i in range(4):
         states = states_after(target, scene, i * PERIOD_NS, rng)
     result = compare(states, truth.surface, truth.solid)
@@ -119,28 +118,6 @@ def test_the_clouds_of_both_cameras_meet_in_the_base_frame(scene: MapScene) -> N
     shared = error < 0.02  # the rest is hidden from the overhead camera
     assert np.count_nonzero(shared) > 100_000
     assert np.percentile(error[shared], 95) <= 0.005
-
-
-@pytest.mark.requirement("A-55", "A-56")
-def test_an_object_is_gone_and_back_within_a_second_at_two_hertz(scene: MapScene, truth: Visible) -> None:
-    """It moves right after an update, so that the next one is half a second away."""
-    target, name = mapper(scene), DEMO.objects[0].name
-    home = DEMO.objects[0].centre(DEMO.table)
-    near = target.lattice.range_of(np.add(home, (-0.03, -0.03, 0.0)), np.add(home, (0.03, 0.03, 0.05)))
-    rng = np.random.default_rng(2)
-    for i in range(10):
-        states = states_after(target, scene, i * PERIOD_NS, rng)
-    assert (states[near] == OCCUPIED).any()
-    try:
-        scene.put(name, (3.0, 3.0, 0.5))
-        for i in range(2):
-            states = states_after(target, scene, (10 + i) * PERIOD_NS, rng)
-        assert not (states[near] == OCCUPIED).any()
-    finally:
-        scene.put(name, home)
-    for i in range(2):
-        states = states_after(target, scene, (12 + i) * PERIOD_NS, rng)
-    assert (states[near] == OCCUPIED).any()
 
 
 def test_the_robot_is_taken_out_where_it_was_last(scene: MapScene) -> None:

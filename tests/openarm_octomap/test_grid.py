@@ -108,33 +108,6 @@ def test_a_cloud_gives_the_same_map_as_its_image(accumulated, reference) -> None
     np.testing.assert_array_equal(grid.blocks.log_odds(), accumulated.blocks.log_odds())
 
 
-@settings(max_examples=12)
-@given(st.integers(0, 2**32 - 1), st.booleans())
-def test_every_ray_is_free_up_to_its_end(seed: int, limited: bool) -> None:
-    """Any pose, any image: cells on the way to a surface (sampled) are free unless a surface is in them."""
-    rng = np.random.default_rng(seed)
-    grid = OccupancyGrid(liboctomap(lower=(-0.8,) * 3, upper=(0.8,) * 3, max_range=0.9 if limited else -1.0))
-    T = se3.make(se3.exp_so3(rng.normal(size=3)), rng.uniform(-1.0, 1.0, 3))
-    image = scan(rng.integers(0, 2000, (48, 64)).astype(np.uint16), T)
-    grid.integrate([image], 0)
-    assert not np.any([grid._through, grid._hits])
-    ends = image.points().astype(np.float64)[::50]
-    cells = grid.lattice.indices(ends)
-    inside = grid.lattice.contains(cells)
-    centres, origin = grid.lattice.centres(cells), T[:3, 3].astype(np.float32).astype(np.float64)
-    distance = np.linalg.norm(centres - origin, axis=1)
-    hit = inside & ((distance <= 0.88) if limited else True)
-    assert (grid.blocks.states()[tuple(cells[hit].T)] == OCCUPIED).all()
-    for centre, far in zip(centres, distance, strict=True):
-        u = np.linspace(0.0, 1.0, 50)[:-2, None] * (min(1.0, 0.85 / far) if limited else 1.0)
-        way = origin + u * (centre - origin)
-        # a sample on the border of two cells may be counted to the wrong one
-        frac = np.abs(way / 0.02 - np.round(way / 0.02)).min(axis=1)
-        at = grid.lattice.indices(way[frac > 0.02])
-        at = at[grid.lattice.contains(at)]
-        assert (grid.blocks.states()[tuple(at.T)] != UNKNOWN).all()
-
-
 @pytest.mark.requirement("A-55", "A-56")
 def test_what_arrives_is_marked_and_what_leaves_is_cleared_in_one_frame_each() -> None:
     """Also after it stood there for a minute: clearing is as quick as marking."""

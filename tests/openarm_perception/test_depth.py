@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from scipy.spatial import cKDTree
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
@@ -129,25 +128,3 @@ def test_limits_must_be_in_order() -> None:
     """Far before near is a mistake in the configuration."""
     with pytest.raises(ValueError, match="far must be larger than near"):
         DepthLimits(near=1.0, far=0.5)
-
-
-@pytest.mark.requirement("A-46")
-def test_clouds_of_two_cameras_agree_in_the_base_frame(tabletop) -> None:
-    """The near camera's points of a box and the table lie on the overhead camera's within its pixels' spacing."""
-    box = tabletop.Thing("red", "box", (0.07, 0.07, 0.06), 0.25, -0.25, 0.4)
-    near = tabletop.look_at((0.38, -0.30, 0.72), (0.25, -0.25, 0.43), (0.3, -1.0, 0.0))
-    clouds = []
-    for view in (tabletop.render([box]), tabletop.render([box], near)):
-        points = Deprojector(DepthLimits(near=0.07, far=0.95)).valid_points(view.millimetres, view.intrinsics)
-        base = points @ view.T_base_camera[:3, :3].T + view.T_base_camera[:3, 3]
-        inside = (np.abs(base[:, :2] - (0.25, -0.25)) < 0.06).all(axis=1) & (base[:, 2] > 0.3)
-        clouds.append(base[inside])
-    tops = [np.median(c[c[:, 2] > 0.45, 2]) for c in clouds]
-    tables = [np.median(c[c[:, 2] < 0.41, 2]) for c in clouds]
-    np.testing.assert_allclose(tops, 0.46, atol=0.0005)
-    np.testing.assert_allclose(tables, 0.40, atol=0.0005)
-    tree = cKDTree(clouds[0])
-    on_top = clouds[1][clouds[1][:, 2] > 0.455]
-    distance, _ = tree.query(on_top)
-    assert len(on_top) > 1000
-    assert np.percentile(distance, 99) < 0.003

@@ -68,7 +68,7 @@ def errors(thing, found) -> dict[str, float]:
     return out
 
 
-@pytest.mark.parametrize(("encoding", "sigma"), [("16UC1", 0.0), ("32FC1", 0.0), ("16UC1", 0.001), ("16UC1", 0.002)])
+@pytest.mark.parametrize(("encoding", "sigma"), [("16UC1", 0.0), ("32FC1", 0.0), ("16UC1", 0.002)])
 @pytest.mark.requirement("A-63", "A-64", "P-15", "B-01")
 def test_objects_anywhere_on_the_table(tabletop, detector, localizer, encoding: str, sigma: float) -> None:
     """16 objects at random places and yaws, overhead camera; p95 within 3 mm and 3 degrees, none beyond 5.

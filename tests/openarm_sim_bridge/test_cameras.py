@@ -123,7 +123,7 @@ def test_what_lies_outside_the_view_is_left_out_and_no_pixel_changes(
     renderer: SnapshotRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hidden = set[bool]()
-    for x in np.linspace(-1.2, 1.2, 13):
+    for x in np.linspace(-1.2, 1.2, 7):
         state = snapshot(0.2, (x, 0.25, 0.4), radius=0.1)
         colour, depth = draw(renderer, state)
         scene = renderer._drawn.scene  # type: ignore[union-attr]

@@ -310,6 +310,7 @@ def drafted(request: pytest.FixtureRequest) -> tuple[Path, mujoco.MjModel]:
     return folder, compiled(file)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("B-07", "R-04")
 def test_openarm_v2_moves_as_its_maker_s_model(drafted):
     folder, maker = drafted

@@ -8,9 +8,12 @@ import pytest
 
 from benchmarks.grasp_trials import BACK, MUJOCO_DEFAULTS, OBJECTS, OPEN, Trial, make, quintic
 
+#: Objects that the hand holds, besides a box and a can.
+OTHERS = [kind for kind in OBJECTS if kind not in ("box", "can", "cube_8cm")]
+
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
-@pytest.mark.parametrize("kind", [kind for kind in OBJECTS if kind != "cube_8cm"])
+@pytest.mark.parametrize("kind", ["box", "can", *(pytest.param(kind, marks=pytest.mark.long) for kind in OTHERS)])
 @pytest.mark.requirement("A-07", "A-69", "P-16")
 def test_an_object_is_held_by_friction_through_lift_hold_shake_and_put_back(kind: str, seed: int) -> None:
     item, error = make(kind, seed)
@@ -42,10 +45,9 @@ def test_an_object_is_held_by_friction_through_lift_hold_shake_and_put_back(kind
     assert not any(warning.number for warning in trial.data.warning)
 
 
-@pytest.mark.parametrize("kind", ["cube_5cm", "can"])
 @pytest.mark.requirement("A-07")
-def test_with_mujocos_own_defaults_the_same_grasp_loses_the_object(kind: str) -> None:
-    item, error = make(kind, 0)
+def test_with_mujocos_own_defaults_the_same_grasp_loses_the_object() -> None:
+    item, error = make("can", 0)
     trial = Trial(item, "right", error, MUJOCO_DEFAULTS)
     start = trial.position
     trial.pick()
@@ -66,8 +68,13 @@ def test_closing_on_nothing_shows_in_gap_and_effort() -> None:
     assert trial.effort < 1.0
 
 
-@pytest.mark.parametrize("times", [3, pytest.param(25, marks=pytest.mark.long)])
-@pytest.mark.parametrize("kind", ["cube_4cm", "box", "cylinder", "can"])
+@pytest.mark.parametrize(
+    ("kind", "times"),
+    [
+        ("cylinder", 3),
+        *(pytest.param(kind, 25, marks=pytest.mark.long) for kind in ("cube_4cm", "box", "cylinder", "can")),
+    ],
+)
 @pytest.mark.requirement("A-07")
 def test_grasps_in_a_row_neither_throw_nor_lose_an_object(kind: str, times: int) -> None:
     """Aimed 2 mm beside where it stands then: lift, put down, leave, twice as fast as the suite."""

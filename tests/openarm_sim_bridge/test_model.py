@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import time
-import xml.etree.ElementTree as ET
 
 import mujoco
 import numpy as np
@@ -185,20 +184,6 @@ def test_arms_crossed_in_front_of_the_chest_are_a_contact(description: RobotDesc
     assert any({a[:12], b[:12]} == {"openarm_left", "openarm_righ"} for a, b in touching), touching
 
 
-@pytest.mark.requirement("A-21")
-def test_targets_move_the_arm_through_the_actuators(description: RobotDescription, model: mujoco.MjModel) -> None:
-    data = put(model, description, home(description))
-    name = "openarm_right_joint5"
-    address = model.joint(name).qposadr[0]
-    before = data.qpos[address]
-    data.ctrl[model.actuator(name).id] = 0.5
-    assert data.qpos[address] == before
-    mujoco.mj_step(model, data)
-    assert 0.0 < abs(data.qpos[address] - before) < 0.01  # no teleport
-    mujoco.mj_step(model, data, 750)
-    assert data.qpos[address] == pytest.approx(0.5, abs=0.01)
-
-
 def test_gravity_is_carried_and_without_compensation_the_arm_sags(
     description: RobotDescription, demo: Scene, cameras: dict[str, CameraConfig], model: mujoco.MjModel
 ) -> None:
@@ -224,42 +209,6 @@ def test_objects_rest_where_the_scene_puts_them(
         np.testing.assert_allclose(data.body(item.name).xpos, T[:3, 3], atol=5e-4, err_msg=item.name)
         np.testing.assert_allclose(data.body(item.name).xmat.reshape(3, 3), T[:3, :3], atol=5e-3)
         assert np.linalg.norm(data.body(item.name).cvel) < 1e-3
-
-
-def free_bodies_first(spec: mujoco.MjSpec, names: set[str]) -> mujoco.MjModel:
-    """The same world with its free objects written before the robot."""
-    spec.compile()
-    root = ET.fromstring(spec.to_xml())
-    world = root.find("worldbody")
-    assert world is not None
-    moved = [body for body in world.findall("body") if body.get("name") in names]
-    for body in moved:
-        world.remove(body)
-    for position, body in enumerate(moved):
-        world.insert(position, body)
-    return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
-
-
-@pytest.mark.requirement("A-22")
-def test_the_world_works_with_free_bodies_first(
-    description: RobotDescription, demo: Scene, cameras: dict[str, CameraConfig], model: mujoco.MjModel
-) -> None:
-    names = {item.name for item in demo.objects}
-    shifted = free_bodies_first(build_spec(description, demo, cameras), names)
-    joint = "openarm_left_joint1"
-    assert model.joint(joint).qposadr[0] == 0
-    assert shifted.joint(joint).qposadr[0] == 7 * len(names)
-    q = home(description) | {"openarm_right_joint2": 1.9, "openarm_left_joint4": 1.0}
-    poses = description.link_poses(q)
-    states = []
-    for compiled in (model, shifted):
-        data = put(compiled, description, q)
-        for link in ("openarm_right_hand_tcp", "openarm_left_hand_tcp"):
-            np.testing.assert_allclose(data.body(link).xpos, poses[link][:3, 3], atol=1e-9)
-        data.ctrl[compiled.actuator("openarm_right_joint4").id] = 1.4
-        mujoco.mj_step(compiled, data, 100)
-        states.append(data.body("openarm_right_hand_tcp").xpos.copy())
-    np.testing.assert_allclose(states[0], states[1], atol=1e-6)
 
 
 @pytest.mark.requirement("A-27")
@@ -290,43 +239,6 @@ def test_cameras_stand_where_the_mount_seed_puts_them(
         off = float(np.linalg.norm(true_mount(camera, seed)[:3, 3] - camera.T_parent_link[:3, 3]))
         assert (off > 1e-3) == (seed is not None and camera.mount_error)
         assert off <= 0.0151
-
-
-@pytest.mark.requirement("A-29")
-def test_depth_comes_from_the_renderer_and_shows_the_table_at_its_distance(
-    description: RobotDescription, cameras: dict[str, CameraConfig]
-) -> None:
-    scene = load_scene("empty")
-    spec = build_spec(description, scene, cameras)
-    compiled = spec.compile()
-    tags = {element.tag for element in ET.fromstring(spec.to_xml()).iter()}
-    assert not tags & {"depth", "equip"}
-    data = put(compiled, description, home(description))
-    camera = cameras["overhead"]
-    with mujoco.Renderer(compiled, camera.height, camera.width) as renderer:
-        renderer.enable_depth_rendering()
-        renderer.update_scene(data, camera.name)
-        depth = renderer.render().copy()
-    T = camera.T_parent_optical
-    for u, v in ((320, 300), (100, 280), (560, 400)):
-        p = se3.apply(T, camera.intrinsics.deproject((u, v), depth[v, u]))
-        assert p[2] == pytest.approx(scene.table.top_z, abs=1e-3)
-
-
-@pytest.mark.requirement("P-27")
-def test_an_object_is_seen_at_the_pixel_where_its_centre_projects(
-    description: RobotDescription, demo: Scene, cameras: dict[str, CameraConfig], model: mujoco.MjModel
-) -> None:
-    data = put(model, description, home(description))
-    camera = cameras["overhead"]
-    with mujoco.Renderer(model, camera.height, camera.width) as renderer:
-        renderer.enable_segmentation_rendering()
-        renderer.update_scene(data, camera.name)
-        identity = renderer.render()[:, :, 0].copy()
-    T_optical_world = se3.inverse(camera.T_parent_optical)
-    for item in demo.objects:
-        u, v = camera.intrinsics.project(se3.apply(T_optical_world, item.centre(demo.table)))
-        assert identity[round(v), round(u)] == model.geom(item.name).id, item.name
 
 
 def test_physics_settings_arrive_in_the_model(description: RobotDescription) -> None:

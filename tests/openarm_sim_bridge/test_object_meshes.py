@@ -33,9 +33,9 @@ def mesh(source: str, k: int = 0, **keys) -> dict:
 STILL = ("mug", "egg", "pear", "screwdriver", "goblet", "superquadric:3", "torus", "spray_bottle", "duck")
 
 
-@pytest.mark.parametrize("other", [0, 1])
-def test_objects_stand_still_for_two_seconds(stage, other) -> None:
-    items = [mesh(s, k, side=min(other, len(load_object(s).sides) - 1), yaw=0.4 * k) for k, s in enumerate(STILL)]
+def test_objects_stand_still_for_two_seconds(stage) -> None:
+    """On the side that is second in frequency, where they have one."""
+    items = [mesh(s, k, side=min(1, len(load_object(s).sides) - 1), yaw=0.4 * k) for k, s in enumerate(STILL)]
     for k, item in enumerate(items):
         item["position"] = [0.3 + 0.26 * (k // 4), -0.42 + 0.28 * (k % 4)]
     table = robot_work().table.model_copy(update={"x": (0.11, 1.4), "y": (-0.7, 0.7)})

@@ -85,6 +85,7 @@ def test_activation_drives_all_joints_to_zero(robot: SimulatedRobot) -> None:
     assert np.abs(robot.world.read_joints().position).max() < 0.15  # they hang
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-03")
 def test_a_sparse_trajectory_is_a_step_and_a_dense_one_a_motion(robot: SimulatedRobot) -> None:
     """The same motion of 0.4 rad in 2 s, by two points and by one for each 10 ms."""

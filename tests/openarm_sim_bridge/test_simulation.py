@@ -284,17 +284,6 @@ def test_stop_ends_the_thread_and_cancels_what_waits() -> None:
     assert "physics" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_a_trajectory_moves_the_physical_joint(bench: Bench) -> None:
-    outcomes: list[TrajectoryOutcome] = []
-    arm = bench.controller.arms["right"]
-    goal = arm.check(Trajectory(("j1",), np.array([0.5]), np.array([[0.6]]), np.zeros((1, 1))))
-    position = bench.world.read_joints().position[:1]
-    bench.simulation.call(lambda: arm.start(goal, bench.world.t_ns, position, outcomes.append)).result(DEADLINE_S)
-    bench.wait(lambda: outcomes)
-    assert outcomes[0].end is End.SUCCEEDED
-    assert bench.states[-1][1].position[0] == pytest.approx(0.6, abs=0.02)
-
-
 # --- the controller alone
 @pytest.mark.requirement("A-23")
 def test_commands_may_be_partial_permuted_and_hold_unknown_names() -> None:

@@ -9,7 +9,6 @@ import time
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from scipy.optimize import least_squares
 
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
@@ -18,7 +17,6 @@ from openarm_common.robot.edges import MovingEdges
 from openarm_common.scene.scene import Scene, SceneObject, load_scene
 from openarm_control.arm import TrajectoryConfig, TrajectoryOutcome
 from openarm_control.carrier import CarrierConfig
-from openarm_control.gripper import GripperGoal, GripperOutcome
 from openarm_control.trajectory import Trajectory, TrajectoryResult
 from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.robot import SimulatedRobot
@@ -69,90 +67,6 @@ def test_an_arm_tracks_a_brisk_motion_within_its_tolerance(stage: Stage, demo: S
     assert outcomes[0].result is TrajectoryResult.SUCCESSFUL, outcomes[0].text
     assert worst < (0.03 if lag else 0.08)
     np.testing.assert_allclose(world.read_joints().position[columns], end, atol=0.005)
-
-
-class Hand:
-    """The right arm of a world, moved through its controllers."""
-
-    def __init__(self, stage: Stage, scene: Scene) -> None:
-        self.world = stage.world(scene)
-        self.controller = SimulatedRobot.controllers(stage, self.world, TrajectoryConfig())
-        self.description = RobotDescription.load()
-        self.arm = self.controller.arms["right"]
-        self.q = self.world.read_joints().position[8:15]
-
-    def tick(self, n: int = 1) -> None:
-        for _ in range(n):
-            self.world.set_targets(self.controller.update(self.world.read_joints(), self.world.period_ns))
-            self.world.step(self.world.steps_per_tick)
-
-    def go(self, position: np.ndarray, seconds: float) -> None:
-        """Point straight down at a TCP position, opening along y."""
-
-        def residual(q: np.ndarray) -> np.ndarray:
-            T = self.description.link_pose("openarm_right_hand_tcp", dict(zip(self.arm.group.names, q, strict=True)))
-            return np.concatenate([T[:3, 3] - position, 0.2 * (T[:3, 2] + [0, 0, 1]), 0.2 * T[[0, 2], 1]])
-
-        found = least_squares(residual, self.q, bounds=(self.arm.group.lower, self.arm.group.upper))
-        assert np.abs(found.fun).max() < 1e-4
-        self.q = found.x
-        goal = Trajectory(self.arm.group.names, np.array([seconds]), self.q[None], np.zeros((1, 7)), np.zeros((1, 7)))
-        outcomes: list[TrajectoryOutcome] = []
-        state = self.world.read_joints()
-        self.arm.start(self.arm.check(goal), state.t_ns, state.position[8:15], outcomes.append)
-        while not outcomes:
-            self.tick()
-        assert outcomes[0].result is TrajectoryResult.SUCCESSFUL, outcomes[0].text
-
-    def grip(self, position: float) -> GripperOutcome:
-        gripper, outcomes = self.controller.grippers["right"], []
-        gripper.start(GripperGoal(position), 0.0, 0.0, outcomes.append)
-        while not outcomes:
-            self.tick()
-        return outcomes[0]
-
-
-@pytest.mark.requirement("A-07", "P-16")
-def test_a_cube_is_lifted_and_put_down_by_friction_alone(stage: Stage) -> None:
-    cube = {"name": "cube", "shape": "box", "size": (0.05,) * 3, "color": "red", "mass": 0.1, "position": (0.27, -0.2)}
-    hand = Hand(stage, with_object(load_scene("empty"), cube))
-    over, at = np.array([0.27, -0.2, 0.53]), np.array([0.27, -0.2, 0.425])
-
-    def height() -> float:
-        return float(hand.world.objects()[0].T_world_object[2, 3])
-
-    assert height() == pytest.approx(0.425, abs=0.001)
-    assert hand.grip(0.044).reached_goal
-    hand.go(over, 2.0)
-    hand.go(at, 1.2)
-    held = hand.grip(0.0)
-    assert held.stalled
-    assert 2 * held.position == pytest.approx(0.05, abs=0.001)
-    hand.tick(30)
-    assert abs(hand.world.read_joints().effort[15]) > 5.0
-    hand.go(over, 1.4)
-    assert height() == pytest.approx(0.53, abs=0.005)
-    hand.tick(500)
-    assert height() == pytest.approx(0.53, abs=0.005)  # no creep
-    hand.go(at + np.array([0.0, 0.0, 0.001]), 1.6)
-    assert hand.grip(0.044).reached_goal
-    hand.go(over, 1.2)
-    T = hand.world.objects()[0].T_world_object
-    np.testing.assert_allclose(T[:3, 3], [0.27, -0.2, 0.425], atol=0.01)
-
-
-def test_a_scene_can_be_exchanged_and_added_to(stage: Stage, demo: Scene) -> None:
-    world = stage.world(demo)
-    for _ in range(20):
-        world.step(world.steps_per_tick)
-    extra = with_object(
-        demo, {"name": "extra", "shape": "box", "size": (0.04,) * 3, "color": "purple", "position": (0.4, 0.0)}
-    )
-    world.extend(stage.compile(world, extra))
-    assert [o.object.name for o in world.objects()][-1] == "extra"
-    world.exchange(stage.compile(world, load_scene("empty")))
-    assert world.objects() == ()
-    assert world.t_ns == 200_000_000
 
 
 def test_an_object_in_the_robot_or_with_a_taken_name_is_refused(stage: Stage, demo: Scene) -> None:
@@ -210,14 +124,6 @@ def thirty_objects(stage: Stage) -> World:
     for _ in range(30):
         world.step(world.steps_per_tick)
     return world
-
-
-def test_thirty_objects_stand_still(stage: Stage) -> None:
-    world = thirty_objects(stage)
-    before = np.array([o.T_world_object for o in world.objects()])
-    for _ in range(100):
-        world.step(world.steps_per_tick)
-    np.testing.assert_allclose([o.T_world_object for o in world.objects()], before, atol=1e-4)
 
 
 @pytest.mark.long

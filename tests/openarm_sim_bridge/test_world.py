@@ -141,11 +141,6 @@ def test_effort_is_what_the_actuator_pushes() -> None:
     assert abs(world.read_joints().effort[2]) <= 30.0 + 1e-9  # never more than the model allows
 
 
-def test_coupled_joint_starts_with_its_leader() -> None:
-    world = make()
-    assert world.data.joint("mimic").qpos[0] == pytest.approx(0.02)
-
-
 def test_objects_report_pose_and_twist_in_the_world_frame() -> None:
     world = make(BALL.format(z=1.0))
     world.data.qvel[:6] = [0.1, 0.2, 0.0, 0.0, 0.0, 3.0]

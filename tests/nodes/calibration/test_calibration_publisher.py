@@ -15,8 +15,6 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics, load_cameras, true_mount
 from openarm_common.errors import OpenArmError
 from openarm_common.records import default_folder
-from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import intrinsics_from_info, transform_to_matrix
 from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF
 from openarm_common.scene.scene import load_scene
@@ -66,26 +64,6 @@ def test_the_right_camera_of_a_pair_goes_with_the_left_one(ros, monkeypatch) -> 
     ros.add(PublisherNode())
     offset = edges(ros)[parent, "head_right_link"][:3, 3] - T[:3, 3]
     np.testing.assert_allclose(offset, -right.baseline * T[:3, 1], atol=1e-6)
-
-
-@pytest.mark.requirement("A-34", "B-14")
-def test_the_overhead_camera_looks_at_the_region_and_the_wrist_camera_moves_with_the_arm(ros) -> None:
-    """Through the tree: the object region projects into the overhead image; joint 1 moves the wrist camera alone."""
-    ros.add(PublisherNode())
-    description = RobotDescription.load()
-    buffer = RobotStateBuffer(description)
-    for (parent, child), T in edges(ros).items():
-        buffer.set_static(parent, child, T)
-    overhead = load_cameras()["overhead"]
-    T = buffer.lookup("overhead_color_optical_frame", "openarm_body_link0", 0)
-    corners = np.array([(x, y, 0.42) for x in (0.16, 0.36) for y in (-0.42, 0.42)])
-    pixels = overhead.intrinsics.project(corners @ T[:3, :3].T + T[:3, 3])
-    assert ((pixels > 10) & (pixels < (629, 469))).all()
-    names = [*description.arm_joints("left"), *description.arm_joints("right")]
-    for t_ns, q in ((0, 0.0), (50_000_000, 0.5)):
-        buffer.add_joint_state(t_ns, names, [q] * len(names))
-    wrist = [buffer.lookup("openarm_body_link0", "wrist_color_optical_frame", t) for t in (0, 50_000_000)]
-    assert np.linalg.norm(wrist[0][:3, 3] - wrist[1][:3, 3]) > 0.05
 
 
 def test_a_camera_on_an_unknown_link_is_refused(ros, tmp_path) -> None:

@@ -122,7 +122,7 @@ def test_servos_are_identified_stored_and_used(ros, bridge) -> None:
     motion = subprocess.Popen([sys.executable, "-m", "openarm_motion.ros.node"])
     try:
         able = {("motion: status", DiagnosticStatus.OK)}  # it has joint states; `openarm up` waits for that, too
-        ros.spin_until(lambda: able & {(s.name, s.level) for m in said for s in m.status}, 60.0, "the motion node")
+        ros.spin_until(lambda: able & {(s.name, s.level) for m in said for s in m.status}, what="the motion node")
         done = identify(bench, arm="right", postures=2)
     finally:
         motion.terminate()

@@ -33,13 +33,11 @@ def test_a_program_picks_and_places_in_two_requests(bench):
 
     unknown, picked, other, placed = bench.program(work)
     assert unknown.code is Code.UNKNOWN_OBJECT
-    with pytest.raises(OpenArmError, match="no 'mug' in view"):
+    with pytest.raises(OpenArmError, match="no 'mug' in view; in view: blue, red"):
         unknown.raise_for_code()
     assert (picked.outcome, picked.code) == ("SUCCESS", Code.OK), picked.message
     assert picked.raise_for_code() is picked
     assert "LIFT" in heard
-    chosen = picked.options[0]
-    assert (chosen.code, chosen.arm, set(chosen.parts)) == ("OK", "right", {"tilt", "width", "side", "room"})
     assert (other.outcome, other.code) == ("REFUSED", Code.NOT_READY)
     assert "still holds 'red'" in other.message
     assert (placed.outcome, placed.label) == ("SUCCESS", "red"), placed.message

@@ -14,10 +14,6 @@ from openarm_interfaces.msg import PickRequest
 from rclpy.task import Future
 
 from openarm_bringup import cli
-from openarm_common.errors import Code
-from openarm_grasp.requests.request import GraspRequest
-from openarm_grasp.ros.client import GraspClient, PairResult
-from tests.nodes.grasp.conftest import silence
 
 STATES = "DETECT TRANSFORM PLAN MOVE_TO_PREGRASP MOVE_TO_GRASP CLOSE_GRIPPER LIFT PLACE RESET IDLE"
 
@@ -34,9 +30,18 @@ def ask(bench, *labels: str, **fields) -> PickTwo.Result:
 
 def simultaneous(bench, **fields) -> tuple[object, Future]:
     """Two grasps whose lifts do not end; the goal and its result."""
-    bench.world.during = lambda what: Future() if len(bench.world.hands) == 2 and what == "execute" else None
+    lifts: list[Future] = []
+
+    def hold(what: str) -> Future | None:
+        arm, _, _ = bench.world.asked[-1]
+        if what != "execute" or arm not in bench.world.hands:
+            return None
+        lifts.append(Future())
+        return lifts[-1]
+
+    bench.world.during = hold
     handle, result = bench.ros.send_goal(bench.two, goal("red", "blue", **fields))
-    bench.until(lambda: len(bench.world.hands) == 2 and bench.world.log[-2:] == ["execute"] * 2, what="both lifts")
+    bench.until(lambda: len(lifts) == 2, what="both lifts")
     return handle, result
 
 
@@ -89,6 +94,11 @@ def test_one_request_at_a_time_and_the_newest_status_is_of_the_one_that_is_at_wo
     assert bench.ros.result(result, 60.0).result.success
     bench.until(lambda: (bench.status[-1].state, bench.status[-1].label) == ("IDLE", "blue"), what="blue is done")
     assert bench.ask("red", dry_run=True).success
+    bench.world.asked.clear()
+    twice = ask(bench, "red", "red")
+    assert (twice.code, twice.outcome, len(twice.results)) == ("INVALID_ARGUMENT", "REFUSED", 0)
+    assert "'red' is asked for twice" in twice.message
+    assert bench.world.asked == []
 
 
 @pytest.mark.requirement("P-01", "P-21")
@@ -112,7 +122,10 @@ def test_a_cancel_stops_both_arms_and_each_hand_keeps_its_object_until_it_is_pla
         assert (placed.success, placed.label, placed.arm) == (True, label, arm), placed.message
         assert {name for name, _, _ in bench.world.asked} == {arm}, f"the {other} hand stays where it is"
     assert bench.world.hands == {}
-    assert ask(bench, "red", "blue", dry_run=True).success
+    bench.world.asked.clear()
+    planned = ask(bench, "red", "blue", dry_run=True)
+    assert (planned.success, planned.simultaneous) == (True, True), planned.message
+    assert bench.world.asked == []
 
 
 def test_a_limit_of_time_ends_both_with_their_hands_closed(bench) -> None:
@@ -137,55 +150,12 @@ def test_a_cancel_while_both_are_looked_at_moves_nothing(bench) -> None:
     assert bench.ask("red").success
 
 
-def test_a_robot_that_goes_silent_ends_both_within_two_seconds(bench) -> None:
-    _, result = simultaneous(bench)
-    bench.world.silent = True
-    end: PickTwo.Result = bench.ros.result(result).result
-    assert end.code == "ROBOT_LOST"
-    assert silence(end.message) < 2.0
-    assert [answer.code for answer in end.results] == ["ROBOT_LOST", "ROBOT_LOST"]
-
-
-def test_a_dry_run_of_two_moves_nothing(bench) -> None:
-    result = ask(bench, "red", "blue", dry_run=True)
-    assert (result.success, result.simultaneous) == (True, True), result.message
-    assert {entry.split()[0] for entry in bench.world.log} == {"plan"}
-    assert {answer.arm for answer in result.results} == {"left", "right"}
-
-
 def test_of_two_that_one_arm_is_asked_for_one_waits_for_the_other(bench) -> None:
     bench.world.objects["blue"][:2] = (0.30, -0.08)
     result = ask(bench, "red", "blue", arms=("right", "right"))
     assert (result.success, result.simultaneous) == (True, False), result.message
     assert [answer.arm for answer in result.results] == ["right", "right"]
     assert "the same arm is asked for: one after the other" in result.message.replace(")", "")
-
-
-def test_what_is_no_pair_is_refused_before_anything_moves(bench) -> None:
-    result = ask(bench, "red", "red")
-    assert (result.code, result.outcome, len(result.results)) == ("INVALID_ARGUMENT", "REFUSED", 0)
-    assert "'red' is asked for twice" in result.message
-    assert bench.world.log == []
-
-
-@pytest.mark.long
-@pytest.mark.requirement("A-65")
-def test_the_client_picks_two_from_plain_python(bench) -> None:
-    heard: list[tuple[str, str]] = []
-
-    def work(grasp: GraspClient) -> list[PairResult]:
-        wanted = GraspRequest("blue", arm="left", place=(0.3, 0.3), object_at=(0.26, 0.21))
-        done = grasp.pick_two("red", wanted, on_feedback=lambda status: heard.append((status.label, status.state)))
-        return [done, grasp.pick_two("red", "red")]
-
-    done, refused = bench.program(work)
-    assert done.success, done.message
-    assert done.raise_for_code() is done
-    assert done.simultaneous
-    assert [(a.label, a.arm) for a in done.results] == [("red", "right"), ("blue", "left")]
-    assert done.results[1].place_position[:2] == (0.3, 0.3)
-    assert {("red", "LIFT"), ("blue", "LIFT")} <= set(heard)
-    assert (refused.code, refused.results) == (Code.INVALID_ARGUMENT, ())
 
 
 def test_openarm_pick_red_blue_picks_both_and_says_so_as_json(bench, tmp_path, capsys) -> None:

@@ -39,7 +39,7 @@ Result = FollowJointTrajectory.Result
 HZ = 100
 #: The fake robot's time runs this much faster than the wall clock; and while something is planned or disturbed on its
 #: way, where a slow machine must be in time, too.
-FASTER, SLOWER = 4.0, 0.5
+FASTER, SLOWER = 4.0, 0.05
 
 
 class FakeRobot:

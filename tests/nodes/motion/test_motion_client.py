@@ -26,26 +26,28 @@ def asked(bench, work: Callable[[MotionClient], Any]) -> Any:
 
     with ThreadPoolExecutor(1) as worker:
         done = worker.submit(run)
-        bench.ros.spin_until(done.done, 40.0, "the program")
+        bench.ros.spin_until(done.done, what="the program")
         return done.result()
 
 
 def test_a_program_plans_agrees_and_moves(bench) -> None:
     stages: list[tuple[str, float]] = []
+    below = se3.make(bench.DOWN, (0.26, -0.24, 0.50))
 
     def work(motion: MotionClient) -> None:
         plan = motion.move_to_named("right", "official_home", scale=1.0, plan_only=True).raise_for_code()
         assert plan.scene_version == 1
-        assert plan.trajectories[0].q.shape[1] == 7
+        (trajectory,) = plan.trajectories
+        assert trajectory.names == bench.description.arm_joints("right")
+        assert trajectory.a.shape == trajectory.q.shape == (len(trajectory.t), 7)
         assert motion.execute("right", plan).raise_for_code().message == "arrived"
         q = motion.compute_ik("right", se3.make(bench.DOWN, (0.26, -0.24, 0.55)))
         motion.move_to_joints("right", q, scale=1.0, on_feedback=lambda *stage: stages.append(stage)).raise_for_code()
-        T = se3.make(bench.DOWN, (0.26, -0.24, 0.50))
-        motion.move_on_line("right", T, scale=1.0).raise_for_code()
+        motion.move_on_line("right", below, scale=1.0).raise_for_code()
 
     asked(bench, work)
     tip = bench.node.service.arms["right"].kinematics.fk(bench.q("right"))
-    np.testing.assert_allclose(tip[:3, 3], (0.26, -0.24, 0.50), atol=2e-3)
+    np.testing.assert_allclose(tip, below, atol=1e-3)
     assert stages[0][0] == "planning"
     assert stages[-1][0] == "executing"
 

@@ -60,44 +60,6 @@ def test_compute_ik_in_the_table_frame_or_what_is_wrong(bench) -> None:
 
 
 # --- moves
-@pytest.mark.requirement("A-25")
-def test_a_move_is_planned_sent_as_joint_targets_and_verified(bench) -> None:
-    feedback: list[MoveArm.Feedback] = []
-    arrived = lambda: feedback and feedback[-1].progress == 1.0  # noqa: E731
-    result = bench.ros.hear_all(bench.move_client, bench.named(), feedback, arrived)
-    assert (result.success, result.code, result.message) == (True, "OK", "arrived")
-    np.testing.assert_allclose(bench.q("right"), [0, 0, 0, 1.5708, 0, 0, 0], atol=1e-3)
-    assert result.trajectory.joint_names == list(bench.description.arm_joints("right"))
-    assert len(result.trajectory.points[0].accelerations) == 7
-    assert (feedback[0].stage, feedback[-1].stage) == ("planning", "executing")
-    assert result.planning_time > 0.0
-
-
-def test_every_kind_of_move(bench) -> None:
-    arm = bench.node.service.arms["left"]
-    T = arm.kinematics.fk(bench.q("left"))
-    below = T.copy()
-    below[2, 3] -= 0.08
-    result = bench.run(
-        bench.move_client,
-        MoveArm.Goal(arm="left", kind=MoveArm.Goal.LINEAR, pose=bench.stamped(below), velocity_scale=1.0),
-    )
-    assert result.success, result.message
-    np.testing.assert_allclose(arm.kinematics.fk(bench.q("left")), below, atol=1e-3)
-    pose = se3.make(bench.DOWN, (0.26, 0.24, 0.15))
-    result = bench.run(
-        bench.move_client,
-        MoveArm.Goal(arm="left", kind=MoveArm.Goal.POSE, pose=bench.stamped(pose, "table"), velocity_scale=1.0),
-    )
-    assert result.success, result.message
-    np.testing.assert_allclose(arm.kinematics.fk(bench.q("left"))[:3, 3], [0.26, 0.24, 0.55], atol=1e-3)
-    home = [bench.description.group_state("left_arm", "home")[n] for n in bench.description.arm_joints("left")]
-    result = bench.run(
-        bench.move_client,
-        MoveArm.Goal(arm="left", kind=MoveArm.Goal.JOINTS, joint_positions=home, velocity_scale=1.0),
-    )
-    assert result.success, result.message
-    np.testing.assert_allclose(bench.q("left"), home, atol=1e-3)
 
 
 def test_refused_moves_say_why(bench) -> None:
@@ -141,34 +103,6 @@ def test_refused_moves_say_why(bench) -> None:
         result = bench.run(bench.move_client, goal)
         assert (result.success, result.code) == (False, code), result.message
         assert text in result.message
-
-
-def test_both_arms_move_at_once_and_one_arm_only_once(bench) -> None:
-    right = bench.start(bench.move_client, bench.named("right"))[1]
-    left = bench.start(bench.move_client, bench.named("left"))[1]
-    bench.ros.spin_until(lambda: len(bench.robot.active) == 2, what="both arms on their way")
-    second = bench.run(bench.move_client, bench.named("right", "home"))
-    assert (second.success, second.code) == (False, "BUSY")
-    assert "right arm is moving already" in second.message
-    for future in (left, right):
-        assert bench.ros.result(future).result.success
-    # free again
-    assert bench.run(bench.move_client, bench.named("right", "home")).success
-
-
-def test_the_executor_answers_while_a_plan_is_searched(bench) -> None:
-    for name in bench.description.arm_joints("right"):
-        bench.robot.state[name] = 0.0
-    bench.ros.spin_until(lambda: abs(bench.node.robot.states.latest()[1]["openarm_right_joint2"]) < 1e-9)
-    bench.ros.spin_until(bench.ik_client.service_is_ready, what="the service")
-    planner = waiting_planner(bench)
-    handle, future = bench.start(bench.move_client, bench.named("right", "home", plan_only=True))
-    bench.ros.spin_until(planner.searching.is_set, what="the search")
-    answer = bench.ros.call(bench.ik_client, ComputeIK.Request(arm="left", pose=bench.stamped(np.eye(4))))
-    assert answer.code == "UNREACHABLE"
-    assert not future.done()
-    bench.ros.result(handle.cancel_goal_async())
-    assert bench.ros.result(future).result.code == "CANCELLED"
 
 
 # --- approaches
@@ -242,23 +176,6 @@ def test_table_comes_from_the_scene_description() -> None:
     np.testing.assert_allclose(table.size, [0.70, 1.20, 0.04])
 
 
-@pytest.mark.requirement("B-50")
-def test_obstacles_travel_with_the_request_and_a_plan_alone_moves_nothing(bench) -> None:
-    # no planning scene that could lack them: the same goal is refused with the box and planned without it
-    before = bench.q("right")
-    arm = bench.node.service.arms["right"]
-    goal = bench.named("right", "official_home", plan_only=True)
-    tip = arm.kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])
-    goal.obstacles = [CollisionBox(id="box", pose=matrix_to_pose(tip), size=Vector3(x=0.05, y=0.05, z=0.05))]
-    result = bench.run(bench.move_client, goal)
-    assert result.code == "IN_COLLISION"
-    assert "box" in result.message
-    result = bench.run(bench.move_client, bench.named("right", "official_home", plan_only=True))
-    assert result.success
-    assert len(result.trajectory.points) > 10
-    np.testing.assert_array_equal(bench.q("right"), before)
-
-
 class WaitingPlanner:
     """Searches until it is stopped."""
 
@@ -288,6 +205,10 @@ def test_a_search_ends_by_cancel_and_with_the_node(bench) -> None:
         planner.searching.clear()
         handle, future = bench.start(client, goal)
         bench.ros.spin_until(planner.searching.is_set, what="the search")
+        # others are answered meanwhile
+        answer = bench.ros.call(bench.ik_client, ComputeIK.Request(arm="left", pose=bench.stamped(np.eye(4))))
+        assert answer.code == "UNREACHABLE"
+        assert not future.done()
         bench.ros.result(handle.cancel_goal_async())
         answer = bench.ros.result(future)
         assert answer.status == 5  # canceled

@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from moveit_msgs.action import ExecuteTrajectory, MoveGroup
 from moveit_msgs.msg import AttachedCollisionObject, CollisionObject, MotionPlanRequest, PlanningScene
 from moveit_msgs.srv import GetCartesianPath, GetPositionFK, GetPositionIK, GetStateValidity
@@ -123,18 +121,3 @@ def test_what_is_honoured_exists(kind: type) -> None:
     for known in _HONOURED[kind]:
         stem = known.removesuffix(".*")
         assert any(path == stem or path.startswith(f"{stem}.") for path in paths), known
-
-
-@given(st.data())
-def test_any_combination_with_a_field_that_is_not_honoured_is_refused(data: st.DataObject) -> None:
-    message = MotionPlanRequest()
-    choices = [(p, o, n, v) for p, o, n, v in _set(message) if "constraints." not in p and "." not in p]
-    chosen = data.draw(st.lists(st.sampled_from(range(len(choices))), min_size=1, unique=True))
-    for k in chosen:
-        _, owner, name, value = choices[k]
-        setattr(owner, name, value)
-    wrong = [choices[k][0] for k in chosen]
-    wrong = [path for path in wrong if not _covered(path, fields.PLAN) and not _leads(path, fields.PLAN)]
-    said = _refusal(message, fields.PLAN)
-    assert bool(said) == bool(wrong)
-    assert not wrong or any(f"field {path}" in said for path in wrong)
