@@ -231,6 +231,16 @@ def ros(ros_domain: int) -> Iterator[RosProbe]:
         probe.close()
 
 
+@pytest.fixture(autouse=True)
+def _robot_as_before() -> Iterator[None]:
+    """Undo what a command of a test has chosen for the process."""
+    before = os.environ.get("OPENARM_ROBOT")
+    yield
+    os.environ.pop("OPENARM_ROBOT", None)
+    if before is not None:
+        os.environ["OPENARM_ROBOT"] = before
+
+
 @pytest.fixture
 def nearer(tmp_path, monkeypatch) -> str:
     """Let the process's robot be one like OpenArm v1 with a higher table and a nearer region; its name."""

@@ -140,6 +140,7 @@ def test_set_up_hands_over_its_arguments_and_the_next_run_does_nothing(machine: 
     assert machine.uv_calls() == []
 
 
+@pytest.mark.long
 def test_a_changed_message_rebuilds_its_package_only_and_a_second_clone_builds_nothing(machine: Machine) -> None:
     machine.run()
     machine.uv_calls()
@@ -156,6 +157,7 @@ def test_a_changed_message_rebuilds_its_package_only_and_a_second_clone_builds_n
     assert not any(call.startswith("build") for call in machine.uv_calls())
 
 
+@pytest.mark.long
 def test_kernels_that_a_pull_has_changed_are_compiled_before_anything_runs(machine: Machine) -> None:
     """Else every node would compile at its first use, and miss its time limits."""
     kernels = machine.root / "openarm_motion" / "planning" / "kernels.py"
@@ -173,6 +175,7 @@ def test_kernels_that_a_pull_has_changed_are_compiled_before_anything_runs(machi
     assert machine.run("x").stderr == ""
 
 
+@pytest.mark.long
 def test_an_interrupted_set_up_leaves_no_stamp_and_the_next_recreates_the_environment(machine: Machine) -> None:
     reached = machine.root.parent / "reached"
     command = [machine.root / "openarm", "x"]

@@ -61,6 +61,7 @@ def repeat(checkout: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=checkout, env=env, capture_output=True, text=True, timeout=120.0, check=False)
 
 
+@pytest.mark.long
 def test_a_test_that_fails_once_is_counted_and_named_with_its_error(checkout: Path) -> None:
     (checkout / "tests" / "nodes" / "test_b.py").write_text(FLAKY)
     done = repeat(checkout, "--times", "2", "--parts", "nodes")
@@ -73,6 +74,7 @@ def test_a_test_that_fails_once_is_counted_and_named_with_its_error(checkout: Pa
     assert (checkout / "logs" / "nodes_2.log").is_file()
 
 
+@pytest.mark.long
 def test_every_test_belongs_to_a_part_and_success_is_zero(checkout: Path) -> None:
     parts = {name: [Path(path).name for path in paths] for name, paths in paths_of(checkout / "tests").items()}
     assert parts == {

@@ -63,6 +63,7 @@ def _view_world(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=env | environ, capture_output=True, text=True, timeout=60.0, check=False)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-14")
 def test_the_viewer_example_steps_a_thousand_times_without_a_display() -> None:
     done = _view_world("empty", "--headless")

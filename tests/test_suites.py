@@ -12,7 +12,7 @@ TESTS = Path(__file__).parent
 WORLDS = {"Trials", "run_campaign", "run_in_new_process"}
 #: What starts a graph as processes.
 GRAPHS = {"start_graph"}
-#: One simulated grasp for each route and kind of evidence; and three in which nothing is grasped.
+#: One simulated grasp for each route and kind of evidence; and two in which nothing is grasped.
 GRASPS = {
     "openarm_grasp/test_any_shape.py::test_what_is_no_prism_is_grasped_on_its_cloud_and_placed",
     "openarm_grasp/test_no_depth.py::test_an_object_of_known_height_is_picked_without_depth",
@@ -20,7 +20,6 @@ GRASPS = {
     "openarm_evaluation/test_campaign_two_arms.py::test_an_object_changes_hands_in_the_middle_and_stands_where_one_arm_alone_cannot_put_it",
     "openarm_evaluation/test_campaign_two_arms.py::test_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped",
     "openarm_evaluation/test_campaign_two_arms.py::test_two_objects_are_grasped_at_once_and_the_arms_keep_apart",
-    "openarm_evaluation/test_campaign.py::test_a_refusal_keeps_its_reason_when_nothing_else_is_in_view",
     "openarm_evaluation/test_campaign.py::test_resume_runs_only_what_is_missing_and_drops_a_torn_line",
     "openarm_evaluation/test_campaign.py::test_of_several_that_were_lifted_the_one_at_the_place_is_judged",
 }  # fmt: skip

@@ -70,6 +70,7 @@ def test_a_goal_whose_answer_is_lost_is_accepted_by_the_status_of_its_server(ask
     assert asked(True, True, True) == ["done"] * 3
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-21")
 def test_a_client_that_is_not_discovered_yet_gets_its_answer_when_it_is_and_its_goal_runs(ros, monkeypatch) -> None:
     tried: list[int] = []

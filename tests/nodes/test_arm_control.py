@@ -108,6 +108,7 @@ def test_joint_states_come_at_each_physics_step_and_are_passed_on_at_the_rate_of
     assert 30 <= len(bench.passed_on) - since <= 110  # 100; fewer where the machine is busy
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-03", "P-22")
 def test_a_hand_opens_and_closes_and_the_emergency_stop_is_of_this_node(bench: Bench) -> None:
     hand = ActionClient(bench.ros.node, ParallelGripperCommand, "/arm_control/right_gripper_controller/gripper_cmd")

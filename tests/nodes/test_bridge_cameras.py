@@ -48,6 +48,7 @@ def depth_to_metres(message: Image) -> np.ndarray:
     return depth
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-26", "A-28", "A-30", "A-58")
 def test_images_info_and_joint_states_belong_together(seeing) -> None:
     colour = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
@@ -135,6 +136,7 @@ def test_a_cube_is_seen_by_the_wrist_camera_where_camera_info_and_tf_say(seeing)
     assert nearest == pytest.approx(in_camera[:, 2].min(), abs=0.002)  # the nearest corner, to a pixel
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-24")
 def test_cameras_draw_only_while_their_images_have_subscribers(seeing) -> None:
     """A CameraInfo alone needs no drawing."""
@@ -305,6 +307,7 @@ def test_stamp_offset_and_intrinsics_bias(seeing) -> None:
     seeing.ros.spin_until(lambda: stamps(infos[-1:])[0] % 10_000_000 == 0, what="stamps without an offset")
 
 
+@pytest.mark.long
 def test_mount_knocked_light_and_depth_patch(seeing) -> None:
     images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
     depths = seeing.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
@@ -337,6 +340,7 @@ def test_mount_knocked_light_and_depth_patch(seeing) -> None:
     shown(images, lambda c: same(c, plain, 2.0), "the true mount and light in colour")
 
 
+@pytest.mark.long
 def test_images_are_late(seeing) -> None:
     """The newest image is older than the newest joint state by the delay. Last: some come after its end."""
     late: list[int] = []
@@ -350,6 +354,7 @@ def test_images_are_late(seeing) -> None:
 
 
 # The last one: what the killed process published counts as there for a while.
+@pytest.mark.long
 def test_images_come_again_after_their_process_was_killed(seeing, monkeypatch) -> None:
     monkeypatch.setattr(camera_feed, "_AGAIN_S", 0.1)
     images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)

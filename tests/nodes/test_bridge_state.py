@@ -98,6 +98,7 @@ def test_hundred_hertz_in_step_with_the_wall_clock(steady) -> None:
     bench.ros.spin_until(in_time, what="100 Hz, and p99 below 15 ms")
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-24")
 def test_the_imu_of_a_hand_publishes_gravity_at_rest_and_the_rate_of_a_turning_joint(steady) -> None:
     bench = steady
@@ -122,6 +123,7 @@ def test_the_imu_of_a_hand_publishes_gravity_at_rest_and_the_rate_of_a_turning_j
     np.testing.assert_allclose(*np.transpose(turned), atol=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-04")
 def test_a_subscriber_that_asks_for_a_deadline_is_notified_of_a_gap(steady) -> None:
     """Lateness is noticed by the middleware; who asks for no deadline, or for best effort, hears all the same."""
@@ -203,6 +205,7 @@ def test_ground_truth_is_the_only_outlet_of_object_poses(steady) -> None:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-47", "A-52")
 def test_depth_is_noisy_and_in_metres_by_parameter(bridge) -> None:
     bench = bridge(depth_encoding="32FC1", depth_noise__enabled=True, scene="empty")

@@ -58,6 +58,7 @@ def test_a_usb_camera_has_the_topics_of_a_camera_without_depth_and_is_opened_aga
     assert not any(infos[0].d)
 
 
+@pytest.mark.long
 def test_a_realsense_has_the_topics_of_the_simulated_cameras_and_is_opened_again_when_it_is_lost(ros: Any) -> None:
     try:
         library()

@@ -72,12 +72,23 @@ async def advertised(socket: aiohttp.ClientWebSocketResponse, op: str, key: str,
     raise AssertionError(f"{name} was not advertised")
 
 
-async def message_of(socket: aiohttp.ClientWebSocketResponse, subscription: int) -> bytes:
-    """Payload of the next message of a subscription: opcode 1, its id, a stamp, the message."""
+async def message_of(socket: aiohttp.ClientWebSocketResponse, channel: dict[str, Any]) -> bytes:
+    """Payload of the next message of a channel: opcode 1, its id, a stamp, the message.
+
+    As viewers do, subscribe again when the topic is advertised anew: its publisher may have been lost for a moment.
+    """
+    wish = {"id": 7, "channelId": channel["id"]}
+    await socket.send_json({"op": "subscribe", "subscriptions": [wish]})
     async for message in socket:
-        if message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 1:
+        if message.type is aiohttp.WSMsgType.TEXT:
+            data = json.loads(message.data)
+            again = [one for one in data.get("channels", []) if one["topic"] == channel["topic"]]
+            if data["op"] == "advertise" and again:
+                wish = {"id": wish["id"] + 1, "channelId": again[0]["id"]}
+                await socket.send_json({"op": "subscribe", "subscriptions": [wish]})
+        elif message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 1:
             _, number, _ = struct.unpack_from("<BIQ", message.data)
-            if number == subscription:
+            if number == wish["id"]:
                 return message.data[13:]
     raise AssertionError("the connection ended before a message came")
 
@@ -105,9 +116,7 @@ def test_a_topic_is_advertised_with_its_definition_and_its_messages_come_byte_fo
             assert channel["schemaName"] == "geometry_msgs/msg/PointStamped"
             for part in ("std_msgs/Header header\n", "MSG: builtin_interfaces/Time\n", "float64 z\n"):
                 assert part in channel["schema"]
-            wish = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]}
-            await socket.send_json(wish)
-            assert await message_of(socket, 7) == serialize_message(message)
+            assert await message_of(socket, channel) == serialize_message(message)
         for socket in sockets:
             await socket.close()
 
@@ -158,8 +167,7 @@ def test_the_meshes_of_the_description_are_served_and_no_other_file(ros, foxglov
     async def look(session: aiohttp.ClientSession) -> list[bytes | None]:
         async with session.ws_connect(foxglove.address(), protocols=[PROTOCOL], max_msg_size=0) as socket:
             channel = await advertised(socket, "advertise", "channels", "/robot_description")
-            await socket.send_json({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]})
-            urdf = deserialize_message(await message_of(socket, 7), String).data
+            urdf = deserialize_message(await message_of(socket, channel), String).data
             address = urdf.split('"')[1]
             assert address.startswith("package://")
             name = mesh.name.replace(" ", "%20")

@@ -144,6 +144,7 @@ def test_a_client_ends_when_its_server_is_stopped_or_killed_and_works_with_the_n
             assert caught.value.code is Code.NOT_READY
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-21")
 def test_a_server_that_halts_for_a_while_is_not_dead_and_one_that_is_killed_then_is(ros, children, patient) -> None:
     with ThreadPoolExecutor() as pool, BackgroundNode("client") as client:
@@ -177,6 +178,7 @@ def test_a_client_notices_the_death_of_its_server_within_two_seconds(children) -
         assert time.monotonic() - killed < 2.0
 
 
+@pytest.mark.long
 def test_the_probe_of_a_supervisor_knows_who_is_silent_and_when_it_is_deaf_itself(ros, children, patient) -> None:
     environ = {name: os.environ[name] for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
     with ReadinessClient(environ) as probe:

@@ -94,6 +94,7 @@ class Bench:
         self.ros.spin_until(step, what=what)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-05")
 def test_depth_of_a_pair_is_what_the_cloud_node_takes(ros) -> None:
     """Depth, CameraInfo and cloud at the stamp of the left image, in its frame; the margin it alone sees is invalid."""
@@ -118,6 +119,7 @@ def test_depth_of_a_pair_is_what_the_cloud_node_takes(ros) -> None:
     assert np.nanmedian(points[..., 2]) == pytest.approx(bench.depth_of_wall, abs=0.006)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-05")
 def test_a_pair_without_a_baseline_is_refused_with_the_reason_until_it_has_one(ros) -> None:
     bench = Bench(ros, encoding="32FC1", stamp_gap=0.01)

@@ -229,6 +229,7 @@ def test_a_message_that_can_t_be_shown_is_said_and_the_rest_goes_on(ros, looking
     looking.wait("health")
 
 
+@pytest.mark.long
 def test_without_a_graph_every_question_has_an_answer(looking: Looking) -> None:
     from openarm_bringup.view.server import Order, Reset
 

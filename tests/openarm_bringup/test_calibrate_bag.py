@@ -118,6 +118,7 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
     return code, out, err
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-28", "A-44")
 def test_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag, known, tmp_path: Path) -> None:
     """One sample of each stand, to 0.05 mm of the true mount; what moved, was empty or had no joints is reported."""

@@ -88,6 +88,7 @@ def test_boards_are_written(capsys, tmp_path: Path, name: str, board: str) -> No
     assert "mm" in out
 
 
+@pytest.mark.long
 def test_wrong_intrinsics_are_found_with_the_mount(capsys, tmp_path: Path) -> None:
     """A camera_info 3 % off fails by name; with free intrinsics the right ones and the true mount come out."""
     known = make_session("in_hand", 10)

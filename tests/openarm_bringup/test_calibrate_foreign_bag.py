@@ -113,6 +113,7 @@ def off(data: dict, known: files.Truth) -> float:
     return mount_error(link @ T_LINK_OPTICAL, known.X)[0]
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-28", "A-44")
 def test_a_bag_of_another_robot_with_a_lens_is_solved_and_its_session_too(capsys, bag, known, tmp_path: Path) -> None:
     """URDF of the bag, CompressedImage, rational_polynomial, joint states of two drivers."""

@@ -70,6 +70,7 @@ def test_pose_pairs_of_other_tools_are_solved_and_stored_by_one_command(
     assert stored.intrinsics is None
 
 
+@pytest.mark.long
 def test_the_kind_that_a_file_of_easy_handeye2_states_is_used_and_a_missing_one_asked_for(capsys, tmp_path) -> None:
     known = files.truth("to_hand")
     path = files.easy_handeye2(tmp_path / "a.samples", known, "eye_on_base")
@@ -89,6 +90,7 @@ def info(path: Path, coefficients: np.ndarray | None = None) -> str:
     return str(path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("setup", "rotation", "unit", "frames", "lens"),
     [

@@ -56,6 +56,7 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict]:
     return code, json.loads(out)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("count", "folds"), [(8, 2), pytest.param(14, 5, marks=pytest.mark.long)])
 @pytest.mark.requirement("R-11")
 def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_back(
@@ -112,6 +113,7 @@ def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_bac
     assert "going back needs" in answer["message"]
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-11")
 def test_zeros_that_are_right_are_left_alone_and_nothing_is_stored(
     capsys, tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch

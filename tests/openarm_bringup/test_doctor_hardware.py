@@ -99,6 +99,7 @@ def test_a_realsense_on_usb_2_is_said(tmp_path: Path) -> None:
     assert "group" in closed[3].advice or "usermod" in closed[3].advice
 
 
+@pytest.mark.long
 def test_doctor_of_the_graph_real_checks_the_hardware() -> None:
     names = {finding.name for finding in gather("real")}
     assert "real-time priority" in names

@@ -29,6 +29,7 @@ def test_the_bag_of_the_repository_gives_its_golden_numbers_twice() -> None:
     assert not golden.compare(golden.read(BAG / "golden.json"), first)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-32")
 def test_the_bag_gives_its_golden_numbers_and_a_changed_one_fails_and_is_named(tmp_path: Path) -> None:
     path = tmp_path / "golden.json"

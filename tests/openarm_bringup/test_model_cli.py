@@ -49,6 +49,7 @@ def test_a_robot_is_drafted_checked_and_its_srdf_written_anew(robots, tmp_path, 
     assert RobotDescription.from_folder("mine").group_state("one_arm", "home") == {"j": 0.5}
 
 
+@pytest.mark.long
 def test_a_robot_of_the_suite_is_right(capsys):
     assert call(capsys, "check", "openarm_v1") == (
         0,

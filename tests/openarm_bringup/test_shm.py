@@ -166,6 +166,7 @@ shm.leave(left, 3)
 """
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-34")
 def test_a_process_whose_threads_hang_leaves_with_its_exit_code_and_nothing_of_it_stays() -> None:
     domain = reserve_domain()

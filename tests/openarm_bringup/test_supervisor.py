@@ -252,6 +252,7 @@ time.sleep(60)
     asyncio.run(body())
 
 
+@pytest.mark.long
 @in_loop
 async def test_a_node_that_hangs_is_started_again_and_one_that_somebody_has_halted_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -416,6 +417,7 @@ def test_the_guard_goes_up_its_ladder(monkeypatch: pytest.MonkeyPatch) -> None:
     assert node.returncode == -signal.SIGKILL
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("body", ["time.sleep(60)", pytest.param(DEAF_TO_INT, marks=pytest.mark.long)])
 @pytest.mark.requirement("P-34")
 def test_children_end_when_the_supervisor_is_killed(tmp_path: Path, body: str) -> None:

@@ -73,6 +73,7 @@ def test_an_image_without_the_board_says_what_was_seen(board: Board) -> None:
         detect(board, np.zeros((4, 4, 3), np.uint8))
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-43")
 def test_the_board_in_mujoco_is_found_to_a_hundredth_of_a_pixel(tmp_path: Path) -> None:
     """Its MJCF, rendered as the suite's cameras are; no shift and no stretch, so pixels and texture are where we think.

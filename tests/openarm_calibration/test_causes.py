@@ -44,6 +44,7 @@ def test_wrong_input_is_named_and_never_silent(kind: wrong_input.Spoil) -> None:
     assert tally.named == len(sets), (tally.grades, tally.said)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("robot", "seed"), [("ur5e", 18), *(pytest.param(*one, marks=pytest.mark.long) for one in product(ROBOTS, (0, 5)))]
 )

@@ -30,6 +30,7 @@ SHIPPED, GAINS = HardwareConfig(mass_error=0.0).of_seed(31), HardwareConfig(mass
 BOTH = ("left", "right")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("hardware", "sides", "places", "cycles"),
     [

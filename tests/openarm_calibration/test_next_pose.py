@@ -130,6 +130,7 @@ def score(arm: Arm) -> float:
     return math.sqrt(np.sum(np.diag(np.linalg.inv(information))[:6] / UNITS**2))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["wrist", pytest.param("overhead", marks=pytest.mark.long)])
 @pytest.mark.requirement("N-07", "A-40")
 def test_the_proposed_pose_is_more_informative_than_others_that_show_the_board(name: str) -> None:
@@ -153,6 +154,7 @@ def test_the_proposed_pose_is_more_informative_than_others_that_show_the_board(n
     assert with_one[0] < 0.95 * np.mean(with_one[1:])
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-11")
 def test_poses_that_are_chosen_for_joint_zeros_tell_them_better() -> None:
     """Six poses of each kind: the deviation that is left of the zeros which no mount takes up, by the true mounts."""

@@ -28,6 +28,7 @@ def test_exact_pairs_give_the_exact_mounts(setup) -> None:
     assert mount_error(found.Z, known.Z) < (1e-6, 1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("setup", "sets"), [("in_hand", 3), *(pytest.param(setup, 12, marks=pytest.mark.long) for setup in SETUPS)]
 )
@@ -45,6 +46,7 @@ def test_the_predicted_error_is_that_of_repetitions_and_the_noise_is_found(setup
     assert np.sqrt(np.mean(np.square(noise), axis=0)) == pytest.approx((1e-3, np.radians(0.2)), rel=0.15)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-36")
 def test_the_refinement_is_nearer_than_closed_forms_and_predicts_left_out_pairs_best() -> None:
     from openarm_calibration.handeye.closed_form import METHODS, closed_form

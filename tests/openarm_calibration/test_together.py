@@ -37,6 +37,7 @@ def erring(known: Known) -> Erring:
     return out
 
 
+@pytest.mark.long
 def test_both_set_ups_in_one_solve_give_each_camera_its_result(session) -> None:
     """Errors stay within the predicted ones; six poses of one camera learn the robot's errors from the other's."""
     wrist, overhead = session("in_hand", 12, px=0.2, seed=3), session("to_hand", 6, px=0.2, seed=4)

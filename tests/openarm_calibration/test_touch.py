@@ -136,6 +136,7 @@ def test_touches_are_kept_in_a_file_and_its_faults_named(tmp_path: Path) -> None
         read_touches(tmp_path / "none.csv")
 
 
+@pytest.mark.long
 def test_the_command_line_compares_and_says_what_is_off(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     known, rng = make_session(), np.random.default_rng(1)
     known.samples.save(tmp_path / "wrist.npz")

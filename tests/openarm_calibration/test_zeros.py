@@ -44,6 +44,7 @@ def test_derivatives_of_the_kinematics_agree_with_differences(values: list[float
         np.testing.assert_allclose(by[:, k], difference(early, late) / (2 * step), atol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-36")
 def test_zeros_of_both_arms_are_found_to_0_05_degrees_and_what_a_mount_takes_up_is_said() -> None:
     """Off by 1° by joint; three sets of two cameras. The benchmark has 200 sets."""

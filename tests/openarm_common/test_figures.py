@@ -58,6 +58,7 @@ def test_an_image_is_part_of_the_page() -> None:
     assert data_uri(b"ab", "image/png") == "data:image/png;base64,YWI="
 
 
+@pytest.mark.long
 def test_neither_library_is_imported_before_the_first_figure() -> None:
     modules = ["openarm_calibration.report.report", "openarm_bringup.commands.tf", "openarm_evaluation.campaign.report"]
     code = f"import sys, {', '.join(modules)}; assert not {{'matplotlib', 'jinja2', 'PIL'}} & sys.modules.keys()"

@@ -162,6 +162,7 @@ def trials(task, tmp_path, **kwargs) -> trial.Trials:
     return trial.Trials(task, SimulatedSenses(depth_noise=False), GraspConfig(), folder=tmp_path, **kwargs)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-14")
 def test_a_refusal_keeps_its_reason_when_nothing_else_is_in_view(tmp_path, monkeypatch) -> None:
     """The order asks for another object of the label, and there is none, then for that one by its place."""

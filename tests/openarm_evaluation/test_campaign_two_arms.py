@@ -110,6 +110,7 @@ def sweep(robot: SimRobot, x: float = 0.27) -> dict[str, Motion]:
     return motions
 
 
+@pytest.mark.long
 def test_an_arm_that_may_not_wait_long_enough_is_refused_and_one_whose_way_is_blocked_holds() -> None:
     robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
     gap, motions = watch_clearance(robot), sweep(robot)

@@ -22,6 +22,7 @@ def files(folder) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.suffix in kinds}
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-18", "B-68")
 def test_sets_are_the_same_for_a_seed_share_nothing_and_go_on_after_a_stop(tmp_path) -> None:
     made = make_data(tmp_path / "a", SIZE)
@@ -96,6 +97,7 @@ def off_centre(boxes: np.ndarray, middles: np.ndarray) -> str:
     return text if mean > 0.5 or most > 0.1 else ""
 
 
+@pytest.mark.long
 @pytest.mark.requirement("B-24")
 def test_the_middle_of_a_labelled_box_is_that_of_the_object(drawn) -> None:
     """All sides have the same margin; boxes shifted by a pixel, or with one side two pixels too far out, would fail."""

@@ -37,6 +37,7 @@ def test_the_robot_in_process_has_the_motion_service_and_a_map_that_shows_the_ob
     assert seen.occupied is not None, seen.why  # it plans with that map
 
 
+@pytest.mark.long
 @pytest.mark.requirement("B-63", "R-15")
 def test_a_table_15_mm_higher_than_believed_is_refused_and_right_when_it_was_measured() -> None:
     demo = load_scene("demo")

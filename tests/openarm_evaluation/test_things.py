@@ -62,6 +62,7 @@ def test_a_box_is_graspable_up_to_the_aperture_less_the_room(yaw) -> None:
     assert decide(box(opening - ROOM - 0.002, 0.1, 0.05), yaw=yaw).yes
 
 
+@pytest.mark.long
 def test_what_is_wider_than_the_aperture_less_the_room_or_flat_on_the_table_is_not_graspable(monkeypatch) -> None:
     monkeypatch.setattr(graspable, "_TILTS", (0.0, math.radians(15.0)))
     opening = 2.0 * RobotDescription.load().hand("right").parts.opening
@@ -80,6 +81,7 @@ def test_long_things_are_graspable_by_a_part_of_them() -> None:
     assert decide(named("banana")).yes
 
 
+@pytest.mark.long
 def test_what_is_far_away_is_out_of_reach() -> None:
     found = decide(box(0.05, 0.05, 0.05), x=0.75, y=-0.55)
     assert not found.yes
@@ -100,6 +102,7 @@ def test_the_grasp_of_the_judge_holds_the_object_between_the_pads_above_the_tabl
     assert se3.apply(found.T_base_tcp, corners)[:, 2].min() >= TOP + 0.002
 
 
+@pytest.mark.long
 def test_tasks_name_each_object_in_turn_and_are_the_same_each_time(tmp_path) -> None:
     make_objects(tmp_path, ("egg", "wedge"))
     tasks = [make_task("objects", seed, str(tmp_path)) for seed in range(3)]
@@ -116,6 +119,7 @@ def test_tasks_name_each_object_in_turn_and_are_the_same_each_time(tmp_path) -> 
             assert task.codes == (Code.OK,)
 
 
+@pytest.mark.long
 def test_a_heap_lies_at_rest_on_the_table_and_all_of_it_is_requested(monkeypatch) -> None:
     monkeypatch.setattr(GraspJudge, "decide", lambda self, parts, T: Graspable(True))
     task = make_task("heap", 3, "superquadrics:40")

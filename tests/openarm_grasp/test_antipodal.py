@@ -24,6 +24,7 @@ def tilted(parts, yaw, x, y):
     return [se3.apply(T, part) for part in parts], T
 
 
+@pytest.mark.long
 @settings(max_examples=2, phases=(Phase.explicit, Phase.generate))
 @given(yaw=st.floats(-3.1, 3.1), x=st.floats(-0.05, 0.05), y=st.floats(-0.05, 0.05))
 def test_an_object_turned_and_moved_gives_the_grasps_turned_and_moved(yaw, x, y):
@@ -129,6 +130,7 @@ def test_a_shadow_of_something_else_is_no_place_for_the_hand():
         assert (deep > 0.004).sum() <= 0.002 * len(hidden)
 
 
+@pytest.mark.long
 def test_the_hand_of_openarm_v2_holds_a_block():
     best = grasps(surface_of([box((0.04, 0.08, 0.05), yaw=0.5)]), hand("openarm_v2", "right"))[0]
     assert best.apertures[0] <= 0.04 <= best.apertures[1]

@@ -58,6 +58,7 @@ def test_images_of_one_camera_are_one_view_and_the_border_of_the_object_is_no_ob
     assert np.allclose(first.others[:, 0], 0.35)
 
 
+@pytest.mark.long
 def test_what_the_border_cuts_is_placed_when_all_of_it_is_seen_there(recorded: Recordings) -> None:
     outcome = recorded(alone("cereal_box", 0.22, 0.42, 0.3, side=3)).ask("anything")
     assert outcome.success, outcome.message
@@ -109,6 +110,7 @@ def test_the_map_around_the_hand_is_in_no_way_where_more_than_was_seen_hangs_in_
     assert asked[0].held
 
 
+@pytest.mark.long
 def test_among_other_things_the_place_is_planned_before_the_lift(recorded: Recordings) -> None:
     items = [
         {"name": name, "shape": "mesh", "object": name, "position": [0.27, y], "yaw": 0.4}
@@ -157,6 +159,7 @@ def test_what_is_seen_away_from_its_target_is_not_said_to_be_placed(recorded: Re
     assert "mm from its target, expected at most 15 mm" in robot.said
 
 
+@pytest.mark.long
 def test_what_was_seen_in_part_must_be_seen_within_half_of_what_counts_as_moved(recorded: Recordings) -> None:
     robot, arm = kept_banana(recorded)
     kept = robot.session.kept[arm]

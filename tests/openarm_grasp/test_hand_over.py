@@ -71,6 +71,7 @@ def test_the_taker_must_cope_with_an_object_that_stands_a_little_off(robot, marg
     assert f"{spot_y:.3f}) m, and the left arm from there" in outcome.message.replace("-0.000", "0.000")
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-12")
 def test_a_spot_without_margin_is_better_than_none(robot) -> None:
     two = robot(0.25, -0.30, hand_over={"abs_y": 0.001, "tries": 50})

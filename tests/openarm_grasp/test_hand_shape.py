@@ -25,6 +25,7 @@ def test_pads_of_a_slide_are_the_same_at_every_aperture_and_as_long_as_the_finge
     assert (z_low, z_high) == pytest.approx((-0.0326, 0.0028), abs=0.0016)
 
 
+@pytest.mark.long
 def test_pads_on_hinges_and_tips_move_with_the_aperture():
     shape = hand("openarm_v2")
     assert (shape.pads[:, 2] <= 0.002).all()

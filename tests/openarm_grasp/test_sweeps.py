@@ -150,6 +150,7 @@ def test_a_thin_heap_is_not_swept() -> None:
         assert push_ways(sweep.met, sweep.end, CONFIG, hand(), HAND) == ()
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-17")
 def test_what_lies_over_others_is_pushed_off_them_above_their_tops() -> None:
     low = [standing(f"low{k}", 0.28 + 0.12 * np.cos(k), 0.15 + 0.12 * np.sin(k)) for k in range(7)]

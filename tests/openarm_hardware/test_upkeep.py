@@ -144,6 +144,7 @@ def test_what_is_set_in_the_motors_is_recorded_and_compared(rig: RobotRig, tmp_p
     ]
 
 
+@pytest.mark.long
 def test_commands_ask_before_they_set_a_zero_and_say_what_they_changed(
     rig: RobotRig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

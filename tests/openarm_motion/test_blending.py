@@ -41,6 +41,7 @@ def in_box(trajectory: Trajectory, waypoints: np.ndarray) -> bool:
     return bool(np.all(q >= waypoints.min(axis=0) - 1e-9) and np.all(q <= waypoints.max(axis=0) + 1e-9))
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-31")
 @given(
     data=st.data(),

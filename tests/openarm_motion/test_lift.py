@@ -66,6 +66,7 @@ def test_only_what_slides_is_fixed_so(robot) -> None:
         robot.with_fixed("openarm_left_joint1", 0.0)
 
 
+@pytest.mark.long
 def test_kinematics_and_collisions_are_those_of_the_measured_height(robot, home, arms) -> None:
     """FK and closed form as the robot's own kinematics has them; a box before the hand is hit at its height alone."""
     height = 0.137
@@ -126,6 +127,7 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> SimRobot:
     return robot
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-05")
 def test_the_tool_goes_to_a_pose_in_the_base_frame_at_any_height(simulated: SimRobot) -> None:
     """Planned from measured joints, carried out by the simulated robot, seen in the simulation itself."""
@@ -138,6 +140,7 @@ def test_the_tool_goes_to_a_pose_in_the_base_frame_at_any_height(simulated: SimR
     assert at(simulated) == pytest.approx(0.12, abs=0.001)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-05")
 def test_the_lift_moves_with_both_arms_and_what_is_planned_next_is_of_its_new_height(simulated: SimRobot) -> None:
     joints = [name for arm in simulated.description.arms.values() for name in arm.joints]

@@ -102,6 +102,7 @@ def test_a_twist_moves_the_tool_as_it_says(arms, home):
     assert bench.said["right"] == {Status.NO_WARNING}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "ticks"), [(1, 240), *(pytest.param(k, 900, marks=pytest.mark.long) for k in range(2))]
 )
@@ -128,6 +129,7 @@ def test_both_arms_jogged_at_random_among_bodies_touch_nothing(arms, home, seed,
     assert all(np.ptp(track, axis=0).max() > 0.3 for track in bench.tracks.values())  # they did move
 
 
+@pytest.mark.long
 def test_at_full_speed_towards_the_table_an_arm_slows_and_what_it_holds_stops_over_it(arms, home, table):
     bench = Bench(arms, home, held={"left": (), "right": (box_from("cube", (0.0, 0.0, 0.05), (0.05, 0.05, 0.15)),)})
     top = table.T[2, 3] + 0.5 * table.size[2]

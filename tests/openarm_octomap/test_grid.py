@@ -313,6 +313,7 @@ def test_points_that_are_not_finite_mark_nothing() -> None:
     assert (update.valid, update.ends, grid.counts()["occupied"]) == (0, 0, 0)
 
 
+@pytest.mark.long
 def test_a_map_of_another_robot_is_refused_and_leaves_the_map_as_it_was(tmp_path, nearer) -> None:
     other, mine = (
         Mapper(RobotDescription.load(name), GridConfig(**SMALL), FilterConfig(enabled=False), FieldConfig())

@@ -10,6 +10,7 @@ from benchmarks.localization import Studio
 from benchmarks.moving_camera import measure
 
 
+@pytest.mark.long
 @pytest.mark.requirement("B-61", "A-72")
 def test_the_error_does_not_grow_with_the_speed_of_the_camera() -> None:
     """By the latest joint state, in the same images, it would be centimetres."""

@@ -88,6 +88,7 @@ def test_what_cannot_be_exported_is_refused() -> None:
         render(posture="dance")
 
 
+@pytest.mark.long
 def test_a_picture_shows_every_object_in_its_colour_and_a_robot_without_colour(tmp_path: Path) -> None:
     path = tmp_path / "demo.png"
     render_png(path, width=640, height=480, view="overhead")

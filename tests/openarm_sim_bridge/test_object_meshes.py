@@ -33,6 +33,7 @@ def mesh(source: str, k: int = 0, **keys) -> dict:
 STILL = ("mug", "egg", "pear", "screwdriver", "goblet", "superquadric:3", "torus", "spray_bottle", "duck")
 
 
+@pytest.mark.long
 def test_objects_stand_still_for_two_seconds(stage) -> None:
     """On the side that is second in frequency, where they have one."""
     items = [mesh(s, k, side=min(1, len(load_object(s).sides) - 1), yaw=0.4 * k) for k, s in enumerate(STILL)]
@@ -68,6 +69,7 @@ def test_an_object_has_its_mass_in_parts_and_is_seen_as_one_geom(stage) -> None:
     np.testing.assert_allclose(data.xipos[body], expected[:3], atol=1e-5)
 
 
+@pytest.mark.long
 def test_an_object_is_spawned_and_taken_out_while_the_world_runs(stage) -> None:
     scene = parse_scene({"objects": [mesh("mug")]}, "here")
     world = stage.world(scene)

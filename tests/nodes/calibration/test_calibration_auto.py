@@ -138,6 +138,7 @@ def rotations(bench: Bench) -> list[np.ndarray]:
     ]  # fmt: skip
 
 
+@pytest.mark.long
 def test_ends_when_the_predicted_error_is_small_enough(ros, posed_robot, tmp_path: Path) -> None:
     bench = Bench(ros, posed_robot, tmp_path, "to_hand", given_pose=False, **{"auto.fewest": 4})
     result = bench.run(poses=12, sigma_translation=0.02, sigma_rotation=0.2)
@@ -162,6 +163,7 @@ def test_cancel_stops_the_motion_and_the_node_is_free_again(ros, posed_robot, tm
     assert ros.call(ros.node.create_client(TakeSample, "/calibration/take_sample"), TakeSample.Request()).success
 
 
+@pytest.mark.long
 def test_says_why_it_can_not(ros, posed_robot, tmp_path: Path) -> None:
     """No board in view and no pose given; a camera that there is not; an arm that is lost; nothing but collisions."""
     bench = Bench(ros, posed_robot, tmp_path, "to_hand", given_pose=False)

@@ -98,6 +98,7 @@ class KnownArm(DynamicsClient):
         return FollowJointTrajectory.Result(error_code=FollowJointTrajectory.Result.SUCCESSFUL)
 
 
+@pytest.mark.long
 def test_known_servos_are_identified_stored_and_used(bridge, monkeypatch) -> None:
     monkeypatch.setattr(excite, "_CYCLES", 4)
     monkeypatch.setattr(ros_dynamics, "DynamicsClient", KnownArm)

@@ -68,6 +68,7 @@ def publisher(scene: str, **more) -> PublisherNode:
     return PublisherNode(parameter_overrides=[Parameter(key, value=value) for key, value in values.items()])
 
 
+@pytest.mark.long
 @pytest.mark.requirement("B-63", "R-15")
 def test_a_table_15_mm_off_is_refused_measured_stored_and_right_for_both_detectors(ros, scene: str) -> None:
     camera = FakeCamera(ros)

@@ -52,6 +52,7 @@ def test_an_empty_hand_is_tried_again_and_recorded_with_its_reason_and_the_comma
     assert bench.world.log[-1] == "move home"
 
 
+@pytest.mark.long
 def test_a_refusal_is_recorded_and_what_is_not_the_robots_fault_is_not(bench, asked) -> None:
     assert bench.ask("mug").recording == "/recordings/1"
     assert asked[0].startswith("UNKNOWN_OBJECT: ")
@@ -61,6 +62,7 @@ def test_a_refusal_is_recorded_and_what_is_not_the_robots_fault_is_not(bench, as
     assert len(asked) == 1
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-02")
 def test_one_of_two_that_is_not_in_view_is_refused_and_the_other_placed_and_there_is_one_recording(
     bench, asked
@@ -77,6 +79,7 @@ def test_one_of_two_that_is_not_in_view_is_refused_and_the_other_placed_and_ther
     assert bench.ask("", phase="place").code == "NOT_READY"
 
 
+@pytest.mark.long
 def test_a_recorder_that_does_not_answer_keeps_no_answer_back(bench) -> None:
     recorder = bench.node._flight_recorder
     assert bench.ask("mug").recording == "", "there is none"

@@ -44,6 +44,7 @@ def test_a_program_picks_and_places_in_two_requests(bench):
     assert bench.world.objects["red"][:2] == pytest.approx((0.3, -0.3), abs=0.005)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-03")
 def test_a_program_means_an_object_by_its_position_and_leaves_others(bench):
     def work(grasp: GraspClient) -> list[GraspResult]:
@@ -63,6 +64,7 @@ def test_a_program_means_an_object_by_its_position_and_leaves_others(bench):
     assert "must stay where they are" in left.message
 
 
+@pytest.mark.long
 def test_a_program_cancels_from_its_feedback_and_what_that_raises_reaches_it(bench):
     def fail(_: object) -> None:
         raise ValueError("a fault in the user's code")
@@ -76,6 +78,7 @@ def test_a_program_cancels_from_its_feedback_and_what_that_raises_reaches_it(ben
     assert bench.program(work).code is Code.CANCELLED
 
 
+@pytest.mark.long
 def test_the_client_notices_that_the_node_is_gone(bench, monkeypatch):
     monkeypatch.setattr(client, "_CHECK_S", 0.05)
     bench.world.during = lambda what: Future()

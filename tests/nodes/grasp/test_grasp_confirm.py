@@ -47,6 +47,7 @@ def path_of(bench, trajectory) -> list[tuple[float, float, float]]:
     return [tuple(T[:3, 3].tolist()) for T in poses]
 
 
+@pytest.mark.long
 def test_what_is_executed_is_what_was_shown_last_and_others_are_served_meanwhile(bench):
     answered = bench.service.call_async(Grasp.Request(label="red", confirm=True))
     overtaken = waiting(bench).plan_id
@@ -76,6 +77,7 @@ def test_what_is_executed_is_what_was_shown_last_and_others_are_served_meanwhile
     assert (late.success, late.code) == (False, "NOT_READY")
 
 
+@pytest.mark.long
 def test_the_client_asks_its_caller(bench):
     asked: list[GraspStatus] = []
 

@@ -65,6 +65,7 @@ def test_a_grasp_by_service_places_the_object_publishes_its_states_and_moves_han
     assert {goal_id[:8].hex() for goal_id in bench.world.goal_ids} == {holds[0].hardware_id}
 
 
+@pytest.mark.long
 def test_out_of_reach_names_the_nearest_arm_distance(bench):
     bench.world.unreachable = True
     answer = bench.ask()
@@ -112,6 +113,7 @@ def test_a_dry_run_plans_to_put_an_object_down_on_the_table_as_it_was_measured_a
     assert len(bench.markers[-1].markers) > 20
 
 
+@pytest.mark.long
 def test_a_robot_that_goes_silent_ends_the_grasp_within_two_seconds(bench):
     never = Future()
     bench.world.during = lambda what: never if what == "execute" else None

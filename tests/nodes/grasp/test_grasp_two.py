@@ -45,6 +45,7 @@ def simultaneous(bench, **fields) -> tuple[object, Future]:
     return handle, result
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-65")
 def test_two_objects_are_picked_at_once_each_by_its_arm_and_each_publishes_its_states(bench) -> None:
     heard: list[PickTwo.Feedback] = []
@@ -73,6 +74,7 @@ def test_two_objects_are_picked_at_once_each_by_its_arm_and_each_publishes_its_s
         assert mine[-1].arm == result.results[k].arm
 
 
+@pytest.mark.long
 def test_one_request_at_a_time_and_the_newest_status_is_of_the_one_that_is_at_work(bench) -> None:
     held_up = Future()
     bench.world.during = lambda what: held_up if bench.world.asked[-1][0] == "left" else None
@@ -128,6 +130,7 @@ def test_a_cancel_stops_both_arms_and_each_hand_keeps_its_object_until_it_is_pla
     assert bench.world.asked == []
 
 
+@pytest.mark.long
 def test_a_limit_of_time_ends_both_with_their_hands_closed(bench) -> None:
     _, answer = simultaneous(bench, timeout=100.0)
     bench.world.step_ns *= 10  # both have come that far in time
@@ -150,6 +153,7 @@ def test_a_cancel_while_both_are_looked_at_moves_nothing(bench) -> None:
     assert bench.ask("red").success
 
 
+@pytest.mark.long
 def test_of_two_that_one_arm_is_asked_for_one_waits_for_the_other(bench) -> None:
     bench.world.objects["blue"][:2] = (0.30, -0.08)
     result = ask(bench, "red", "blue", arms=("right", "right"))

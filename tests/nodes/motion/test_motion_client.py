@@ -78,6 +78,7 @@ def test_a_program_changes_the_scene_and_reads_why_there_is_no_plan(bench) -> No
     asked(bench, work)
 
 
+@pytest.mark.long
 def test_a_program_moves_both_arms(bench) -> None:
     targets = [ArmTarget(arm=arm, kind=ArmTarget.NAMED, named="official_home") for arm in ("left", "right")]
     result = asked(bench, lambda motion: motion.move_both(targets, scale=1.0))

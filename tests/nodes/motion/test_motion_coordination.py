@@ -51,6 +51,7 @@ def leaving(bench) -> tuple[object, object]:
     return slower(left.trajectory, 5), right.trajectory
 
 
+@pytest.mark.long
 @pytest.mark.requirement("N-12")
 def test_an_arm_rests_until_the_one_under_way_leaves_room(bench) -> None:
     slow, quick = leaving(bench)
@@ -130,6 +131,7 @@ def approach(arm: str, y: float) -> PlanApproach.Goal:
     )
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-68")
 def test_an_approach_is_planned_around_where_the_other_arm_will_end(bench) -> None:
     slow, _ = leaving(bench)
@@ -152,6 +154,7 @@ def test_an_approach_is_planned_around_where_the_other_arm_will_end(bench) -> No
 # --- what is held
 
 
+@pytest.mark.long
 @pytest.mark.requirement("P-04")
 def test_what_is_held_stays_so_until_a_request_says_otherwise(bench) -> None:
     plan = bench.run(bench.plan_client, approach("right", -0.24))

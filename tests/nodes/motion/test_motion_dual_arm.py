@@ -39,6 +39,7 @@ def watched(bench, goal: MoveArms.Goal) -> tuple[MoveArms.Result, float]:
     return future.result().result, min(scene.separation(q) for q in configurations)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "strategy", [pytest.param(MoveArms.Goal.TOGETHER, marks=pytest.mark.long), MoveArms.Goal.STAGGERED]
 )
@@ -58,6 +59,7 @@ def test_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
     np.testing.assert_allclose(tip, [0.30, 0.0, 0.62], atol=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-74")
 def test_an_arm_in_the_way_yields_and_another_stays(bench) -> None:
     result, _ = watched(bench, both_goal(over_the_middle(bench, "left"), home("right")))

@@ -98,6 +98,7 @@ def test_a_silent_robot_ends_a_motion_within_two_seconds(bench) -> None:
     assert "no fresh /joint_states" in result.message
 
 
+@pytest.mark.long
 def test_a_controller_that_vanishes_ends_a_motion_within_two_seconds(bench) -> None:
     _, future = bench.begin("right", bench.slow_plan())
     begin_ns = bench.robot.t_ns

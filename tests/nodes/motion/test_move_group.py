@@ -134,6 +134,7 @@ def test_a_joint_goal_is_planned_shown_and_executed(client: Client) -> None:
     assert client.q() == pytest.approx(goal, abs=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("B-40")
 def test_move_action_plans_and_moves_to_a_pose_within_its_tolerance_unless_it_is_to_plan_only(client: Client) -> None:
     before = client.q()
@@ -153,6 +154,7 @@ def test_move_action_plans_and_moves_to_a_pose_within_its_tolerance_unless_it_is
     assert len(result.planned_trajectory.joint_trajectory.points) > 2
 
 
+@pytest.mark.long
 def test_a_goal_that_is_cancelled_or_stopped_by_the_event_ends_with_the_arm_holding(client: Client) -> None:
     goal = MoveGroup.Goal(request=client.joint_goal(client.named()))
     goal.request.max_velocity_scaling_factor = goal.request.max_acceleration_scaling_factor = 0.1
