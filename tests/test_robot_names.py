@@ -73,6 +73,7 @@ def names() -> set[str]:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.requirement("R-07", "B-13")
 def test_no_name_of_a_robot_is_in_the_page_or_a_report(names):
     """Texts and attributes in quotes, of what a browser shows; comments apart."""

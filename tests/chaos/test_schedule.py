@@ -14,6 +14,7 @@ ARMS = ("left", "right")
 NODES = ["bridge", "motion", "grasp"]
 
 
+@pytest.mark.long
 @given(seed=st.integers(0, 2**32), kinds=st.lists(st.sampled_from(sorted(KINDS)), unique=True, min_size=1))
 def test_a_seed_repeats_its_faults_and_every_kind_has_its_turn(seed: int, kinds: list[str]) -> None:
     number = 3 * len(kinds)

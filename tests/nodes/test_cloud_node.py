@@ -92,6 +92,7 @@ def test_one_point_a_centimetre_after_the_voxel_filter(ros) -> None:
     np.testing.assert_allclose(points[:, 2], 0.7, atol=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-51")
 def test_flying_pixels_are_dropped_as_statistical_outliers(ros) -> None:
     """With k = 20 and 2 sigma pixels between the near and the far surface go, the surfaces stay."""

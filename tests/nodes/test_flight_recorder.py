@@ -45,6 +45,7 @@ def chat(ros, recorder: FlightRecorder, *texts: str) -> None:
     chatter.wait_for_all_acked()
 
 
+@pytest.mark.long
 def test_what_was_said_is_saved_with_the_reason(ros, start, tmp_path: Path) -> None:
     recorder = start()
     refused = save(ros, "TOO_EARLY")

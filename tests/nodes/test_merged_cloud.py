@@ -136,6 +136,7 @@ def test_the_clouds_of_both_cameras_meet_within_5_mm_though_one_of_them_moves(mo
     assert np.median(moved) > 0.005, "the arm must be fast enough to tell stamps apart"
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-46", "A-50", "A-51")
 def test_filters_hold_for_the_merged_cloud(moving) -> None:
     """One point a cell of 1 cm where both cameras look, also with outliers dropped."""

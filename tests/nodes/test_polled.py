@@ -11,6 +11,7 @@ from openarm_common.ros.node import QOS_COMMAND
 from openarm_common.ros.polled import Polled, Source
 
 
+@pytest.mark.long
 def test_messages_are_taken_when_asked_for_with_the_time_of_their_arrival(ros) -> None:
     polled = Polled(ros.node, Source(String, "/polled", QOS_COMMAND, silence=0.2))
     publisher = ros.node.create_publisher(String, "/polled", QOS_COMMAND)

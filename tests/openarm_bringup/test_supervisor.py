@@ -277,6 +277,7 @@ async def test_a_node_that_hangs_is_started_again_and_one_that_somebody_has_halt
         assert gone(pid)
 
 
+@pytest.mark.long
 @in_loop
 async def test_restarts_end_after_the_maximum_with_the_log_in_the_message(tmp_path: Path) -> None:
     crash = "time.sleep(0.2); print('no camera found', flush=True); sys.exit(3)"

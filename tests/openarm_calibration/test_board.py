@@ -40,6 +40,7 @@ def photograph(board: Board, T: np.ndarray, rng: np.random.Generator) -> np.ndar
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
 @pytest.mark.requirement("A-42")
 def test_boards_are_found_in_at_least_95_percent_of_views_and_never_in_a_wrong_order(board: Board) -> None:

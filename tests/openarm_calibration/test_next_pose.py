@@ -67,6 +67,7 @@ class Arm:
         return True
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param("wrist", marks=pytest.mark.long), "overhead"])
 @pytest.mark.requirement("N-07")
 def test_eight_proposed_poses_calibrate(name: str) -> None:

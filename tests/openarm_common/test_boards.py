@@ -21,6 +21,7 @@ def test_a_hand_holds_it_before_a_fixed_camera():
     np.testing.assert_allclose(board.T_link_fixture, place, atol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("robot", "place"), [("openarm_v1", (0.33, -0.2, 0.405)), ("nearer", (0.32, -0.2, 0.455))])
 def test_it_lies_on_the_table_before_the_camera_of_a_hand(nearer, monkeypatch, robot, place):
     monkeypatch.setenv(ROBOT, robot)

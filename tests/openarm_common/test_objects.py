@@ -232,6 +232,7 @@ def test_lines_through_a_part_end_at_its_faces() -> None:
     np.testing.assert_allclose(found.normals[0], [[0, -1, 0], [0, 1, 0]], atol=1e-12)
 
 
+@pytest.mark.long
 def test_the_suite_has_objects_of_real_size_and_all_can_be_read() -> None:
     names = object_names()
     assert len(names) >= 24

@@ -75,6 +75,7 @@ def test_an_arm_that_the_robot_lacks_is_refused_with_those_it_has():
         RobotDescription.load().arm("third")
 
 
+@pytest.mark.long
 def test_arms_that_are_no_mirror_images_are_not_mirrored(robots):
     altered(robots, mirror=[])
     with pytest.raises(OpenArmError, match="no mirror images"):

@@ -151,6 +151,7 @@ def test_clutter_is_five_to_eight_objects_each_asked_for() -> None:
         assert len({item.name for item in task.scene.objects}) == len(task.labels)
 
 
+@pytest.mark.long
 def test_tasks_come_from_set_and_seed_alone() -> None:
     for name in set(SUITES) - set(THINGS):  # for those see test_things.py
         assert make_task(name, 7) == make_task(name, 7)

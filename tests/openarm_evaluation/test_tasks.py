@@ -68,6 +68,7 @@ def test_an_object_to_push_is_drawn_where_it_has_always_been():
     assert digest(first, 21) == "8b0596d64ece80df"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suite", ["nominal", "handover", "pairs", "clutter"])
 def test_tasks_are_on_the_table_and_in_the_region_of_the_robot(nearer, suite):
     for seed in range(2):

@@ -42,6 +42,7 @@ def free_states(arm: Arm, home: dict[str, float], count: int, seed: int, boxes: 
     return np.array([q for q in states if not scene.collides(q)][:count])
 
 
+@pytest.mark.long
 @pytest.mark.requirement("A-68")
 def test_paths_between_any_states_are_free_for_the_exact_layer(arms: dict[str, Arm], home: dict[str, float]) -> None:
     arm = arms["left"]

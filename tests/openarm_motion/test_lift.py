@@ -87,6 +87,7 @@ def test_kinematics_and_collisions_are_those_of_the_measured_height(robot, home,
         assert FastScene([scene]).free_many(q[None])[0] == (not hit)
 
 
+@pytest.mark.long
 def test_arms_stay_those_of_a_height_that_is_near_enough_or_not_known(home, arms) -> None:
     arms.follow(home | {LIFT: 0.137})
     first = arms[SIDE]

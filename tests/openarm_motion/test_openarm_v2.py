@@ -46,6 +46,7 @@ def test_the_arms_hang_and_open_as_those_of_openarm_v1(robot):
         assert max(abs(tip["1"][0, 3]) for tip in tips) < 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.requirement("B-13")
 def test_a_pose_over_a_table_is_planned_from_home(arm):
     robot = RobotDescription.load("openarm_v2")

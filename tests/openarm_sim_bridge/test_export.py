@@ -105,6 +105,7 @@ def test_a_picture_shows_every_object_in_its_colour_and_a_robot_without_colour(t
     assert empty[..., 1].max() < 60
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("view", [v if v == "top" else pytest.param(v, marks=pytest.mark.long) for v in VIEWS])
 def test_every_view_shows_the_robot(view: str) -> None:
     image = render("empty", width=160, height=120, view=view)

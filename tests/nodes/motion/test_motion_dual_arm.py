@@ -86,6 +86,7 @@ def stay(bench, arm: str) -> ArmTarget:
     return ArmTarget(arm=arm, kind=ArmTarget.JOINTS, joint_positions=bench.q(arm).tolist())
 
 
+@pytest.mark.long
 def test_when_one_arm_fails_the_other_holds(bench) -> None:
     targets = [ArmTarget(arm=arm, kind=ArmTarget.NAMED, named="official_home") for arm in ("left", "right")]
     goal = both_goal(*targets)
