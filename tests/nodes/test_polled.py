@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 
+import pytest
 from std_msgs.msg import String
 
 from openarm_common.ros.node import QOS_COMMAND
