@@ -15,6 +15,8 @@ from pathlib import Path
 import pytest
 import setuptools
 
+from openarm_bringup import warm
+
 _ROOT = Path(__file__).parents[1]
 _PACKAGES = sorted(path.parent.name for path in _ROOT.glob("openarm_*/__init__.py"))
 _INTERFACES = sorted(path.parent.name for path in _ROOT.glob("interfaces/*/package.xml"))
@@ -71,6 +73,11 @@ def _project() -> dict[str, object]:
 def test_every_package_is_in_the_wheel_s_list() -> None:
     build = tomllib.loads((_ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert sorted(build["packages"]) == _PACKAGES
+
+
+def test_set_up_compiles_kernels_of_every_package_that_has_some() -> None:
+    made = {path.relative_to(_ROOT).parts[0] for path in _ROOT.glob("openarm_*/**/*.py") if "njit" in path.read_text()}
+    assert made - {"openarm_common"} <= {part.__module__.partition(".")[0] for part in warm.PARTS}
 
 
 def test_every_interface_package_is_built_by_the_launcher() -> None:
