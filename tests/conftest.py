@@ -242,6 +242,19 @@ def _robot_as_before() -> Iterator[None]:
 
 
 @pytest.fixture
+def own_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibrations of one test alone."""
+    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
+
+
+@pytest.fixture
+def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Records of running graphs of one test alone."""
+    (tmp_path / "xdg").mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "xdg"))
+
+
+@pytest.fixture
 def nearer(tmp_path, monkeypatch) -> str:
     """Let the process's robot be one like OpenArm v1 with a higher table and a nearer region; its name."""
     robots = tmp_path / "models" / "robots"

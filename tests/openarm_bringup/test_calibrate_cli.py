@@ -20,17 +20,14 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose
 from tests.openarm_calibration.known_session import make_session
 
+pytestmark = pytest.mark.usefixtures("own_store")
+
 
 @pytest.fixture(scope="module")
 def session_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("session") / "wrist.npz"
     make_session("in_hand", 10).samples.save(path)
     return path
-
-
-@pytest.fixture(autouse=True)
-def _own_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
 
 
 def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:

@@ -20,16 +20,11 @@ from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.robot.description import RobotDescription
 from tests.openarm_calibration import foreign_files as files
 
-pytestmark = pytest.mark.requirement("R-14")
+pytestmark = [pytest.mark.requirement("R-14"), pytest.mark.usefixtures("own_store")]
 
 BOARD = "charuco:7x5:34mm:26mm:DICT_6X6_250"
 RATIONAL = np.array([0.2, -0.1, 0.001, -0.0005, 0.02, 0.35, -0.05, 0.01])
 PLUMB_BOB = np.array([-0.25, 0.06, 0.001, 0.0005, 0.0])
-
-
-@pytest.fixture(autouse=True)
-def _own_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
 
 
 def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:

@@ -19,11 +19,7 @@ from openarm_common.errors import OpenArmError
 sys.path.insert(0, str(Path(__file__).parent))
 from test_supervisor import running, toy
 
-
-@pytest.fixture(autouse=True)
-def own_state_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "xdg").mkdir()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "xdg"))
+pytestmark = pytest.mark.usefixtures("own_state")
 
 
 def test_a_node_that_can_be_spared_is_given_up_and_the_rest_goes_on(tmp_path: Path) -> None:

@@ -14,10 +14,7 @@ from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.demo import mounts
 
-
-@pytest.fixture(autouse=True)
-def _own_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
+pytestmark = pytest.mark.usefixtures("own_store")
 
 
 def answer(*, success: bool = True) -> AutoCalibrate.Result:

@@ -30,6 +30,8 @@ from openarm_bringup.supervision.supervisor import Event, Supervisor
 from openarm_common.errors import Code, OpenArmError
 from tests.conftest import DEADLINE_S
 
+pytestmark = pytest.mark.usefixtures("own_state")
+
 #: Touches the file named by the first argument, as a server that has come up.
 READY = "import os, pathlib, sys, time; pathlib.Path(sys.argv[1]).write_text(str(os.getpid()));"
 
@@ -126,12 +128,6 @@ async def running(
         yield run
     finally:
         await run.supervisor.stop()
-
-
-@pytest.fixture(autouse=True)
-def own_state_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "xdg").mkdir()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "xdg"))
 
 
 def gone(pid: int) -> bool:

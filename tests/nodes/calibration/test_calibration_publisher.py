@@ -19,11 +19,7 @@ from openarm_common.ros.convert import intrinsics_from_info, transform_to_matrix
 from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF
 from openarm_common.scene.scene import load_scene
 
-
-@pytest.fixture(autouse=True)
-def _own_store(tmp_path, monkeypatch) -> None:
-    """A store of this test alone."""
-    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
+pytestmark = pytest.mark.usefixtures("own_store")
 
 
 def edges(ros) -> dict[tuple[str, str], np.ndarray]:

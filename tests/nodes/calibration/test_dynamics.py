@@ -29,12 +29,9 @@ from openarm_common.robot.servos import ArmLoad
 from openarm_common.ros.convert import ns_to_stamp, trajectory_from_msg
 from openarm_sim_bridge.world.hardware import HardwareConfig, drawn
 
+pytestmark = pytest.mark.usefixtures("own_store")
+
 NAMES = ("a", "b")
-
-
-@pytest.fixture(autouse=True)
-def _own_store(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
 
 
 def identify(bench, **options) -> Outcome:

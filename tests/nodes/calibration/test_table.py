@@ -28,15 +28,12 @@ from openarm_perception.ros.detector_node import DetectNode
 from tests.nodes.detect_bench import TABLE as SEEN
 from tests.nodes.detect_bench import Bench, FakeCamera
 
+pytestmark = pytest.mark.usefixtures("own_store")
+
 BASE_FRAME = RobotDescription.load().base
 
 #: 15 mm below what the camera sees.
 CONFIGURED = SEEN - 0.015
-
-
-@pytest.fixture(autouse=True)
-def _own_store(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
 
 
 @pytest.fixture
