@@ -78,6 +78,8 @@ def test_what_is_recorded_is_replayed(ros, tmp_path: Path) -> None:
             (offered,) = ros.node.get_publishers_info_by_topic("/robot_description")
             assert offered.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
             assert player.published == 41
+            player.play(0.0, 3600.0, 0.0, threading.Event())
+            assert player.published == 42, "what is latched is of any later time, too"
     assert heard == [str(i) for i in range(40)]
 
 

@@ -35,10 +35,8 @@ TOY = """
 
 
 @pytest.fixture(autouse=True)
-def toy_daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "xdg").mkdir()
+def toy_daemon(own_state: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "toy_daemon.py").write_text(textwrap.dedent(TOY))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "xdg"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(activation, "_MODULE", "toy_daemon")
     monkeypatch.setattr(activation, "_PAUSE_S", 0.01)

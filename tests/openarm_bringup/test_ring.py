@@ -45,9 +45,11 @@ def noise(size: int, seed: int) -> str:
 
 
 def test_messages_are_kept_for_a_time() -> None:
-    ring = ring_of(seconds=10.0)
+    ring, short = ring_of(seconds=10.0), ring_of()
     for second in range(100):
-        say(ring, second, str(second))
+        for one in [ring, *([short] if second >= 89 else [])]:
+            say(one, second, str(second))
+    assert ring.bytes == short.bytes, "what was dropped takes no memory"
     assert said(ring) == [str(second) for second in range(89, 100)]
     assert ring.moment().seconds == pytest.approx(10.0)
     assert ring.moment().topics == [CHATTER], "topics without a message are left out"
