@@ -15,7 +15,6 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from openarm_bringup import cli
 from openarm_bringup.bags.bag import BagWriter
 from openarm_bringup.bags.ros.listener import from_profile
 from openarm_calibration.handeye.refine import mount_error
@@ -25,6 +24,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, ns_to_stamp
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+from tests.openarm_bringup.commands import calibrate
 from tests.openarm_calibration.known_session import BOARD, Known, make_session, photograph
 
 MS = 1_000_000
@@ -112,19 +112,13 @@ def bag(tmp_path_factory: pytest.TempPathFactory, known: Known) -> Path:
     return record(tmp_path_factory.mktemp("bags") / "bag", known, PLACES)
 
 
-def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
-    code = cli.run(["calibrate", *argv])
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
 @pytest.mark.long
 @pytest.mark.requirement("P-28", "A-44")
 def test_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag, known, tmp_path: Path) -> None:
     """One sample of each stand, to 0.05 mm of the true mount; what moved, was empty or had no joints is reported."""
     store, session = tmp_path / "store", tmp_path / "session.npz"
     argv = ("--store", str(store), "--session", str(session))
-    code, out, err = run(capsys, "solve", str(bag), "--save", *argv, "--json")
+    code, out, err = calibrate(capsys, "solve", str(bag), "--save", *argv, "--json")
     assert code == 0, err
     data = json.loads(out)
     stills = data["stills"]
@@ -143,7 +137,7 @@ def test_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag, known, 
     assert angle < math.radians(0.01)
     samples, digest = load_session(session, known.description)
     assert (len(samples), digest) == (PLACES, stored.session)
-    code, out, _ = run(capsys, "check", str(bag), "--store", str(store))
+    code, out, _ = calibrate(capsys, "check", str(bag), "--store", str(store))
     assert code == 0
     assert "standstills of the robot" in out
     assert "images not used, MOVING, such as: the robot moves: openarm_right_joint" in out
@@ -164,7 +158,7 @@ def test_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag, known, 
 )
 def test_wrong_calls_on_a_bag(capsys, bag, tmp_path, monkeypatch, argv: list[str], code: int, words: str) -> None:
     monkeypatch.chdir(tmp_path)
-    got, _, err = run(capsys, "solve", str(bag), *argv)
+    got, _, err = calibrate(capsys, "solve", str(bag), *argv)
     assert got == code, err
     assert words in err
     assert list(tmp_path.iterdir()) == []
@@ -172,7 +166,7 @@ def test_wrong_calls_on_a_bag(capsys, bag, tmp_path, monkeypatch, argv: list[str
 
 @pytest.mark.parametrize("topic", ["/wrist/color/image_raw", "/wrist/color/camera_info", "/joint_states"])
 def test_a_bag_that_lacks_a_topic_is_refused(capsys, known, tmp_path: Path, topic: str) -> None:
-    code, _, err = run(capsys, "solve", str(record(tmp_path / "bag", known, 1, without=topic)))
+    code, _, err = calibrate(capsys, "solve", str(record(tmp_path / "bag", known, 1, without=topic)))
     assert code == 2
     assert topic.removeprefix("/wrist") in err
 
@@ -180,12 +174,12 @@ def test_a_bag_that_lacks_a_topic_is_refused(capsys, known, tmp_path: Path, topi
 def test_options_of_a_bag_are_refused_for_a_session_file(capsys, known, tmp_path: Path) -> None:
     path = tmp_path / "s.npz"
     known.samples.save(path)
-    code, _, err = run(capsys, "solve", str(path), "--camera", "wrist", "--mount-seed", "1")
+    code, _, err = calibrate(capsys, "solve", str(path), "--camera", "wrist", "--mount-seed", "1")
     assert code == 2
     assert "--camera, --mount-seed: for a bag" in err
 
 
 def test_a_folder_that_is_no_bag_is_refused(capsys, tmp_path: Path) -> None:
-    code, _, err = run(capsys, "solve", str(tmp_path))
+    code, _, err = calibrate(capsys, "solve", str(tmp_path))
     assert code == 2
     assert "is not a bag" in err

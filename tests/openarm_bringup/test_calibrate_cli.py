@@ -12,12 +12,12 @@ from xml.etree import ElementTree
 import pytest
 from openarm_interfaces.action import AutoCalibrate
 
-from openarm_bringup import cli
 from openarm_bringup.calibration import run as calibration
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose
+from tests.openarm_bringup.commands import calibrate
 from tests.openarm_calibration.known_session import make_session
 
 pytestmark = pytest.mark.usefixtures("own_store")
@@ -30,29 +30,23 @@ def session_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
-    code = cli.run(["calibrate", *argv])
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
 @pytest.mark.requirement("P-28")
 def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_path: Path) -> None:
     """From a session file to a stored calibration and a page, and back."""
-    assert run(capsys, "list")[1].startswith("0 stored")
-    code, out, _ = run(capsys, "save", str(session_file))
+    assert calibrate(capsys, "list")[1].startswith("0 stored")
+    code, out, _ = calibrate(capsys, "save", str(session_file))
     assert code == 0
     assert all(part in out for part in ("predicted", "DANIILIDIS", "Stored in"))
-    assert run(capsys, "save", str(session_file), "--algorithm", "park", "--force")[0] == 0
-    code, out, _ = run(capsys, "list")
+    assert calibrate(capsys, "save", str(session_file), "--algorithm", "park", "--force")[0] == 0
+    code, out, _ = calibrate(capsys, "list")
     assert "2 in its history" in out
     assert "mount seed 1" in out
-    assert run(capsys, "rollback", "wrist")[0] == 0
-    code, _, err = run(capsys, "rollback", "wrist")
+    assert calibrate(capsys, "rollback", "wrist")[0] == 0
+    code, _, err = calibrate(capsys, "rollback", "wrist")
     assert code == 1
     assert "going back needs a calibration of" in err
     page = tmp_path / "report.html"
-    assert run(capsys, "report", str(session_file), str(page))[0] == 0
+    assert calibrate(capsys, "report", str(session_file), str(page))[0] == 0
     text = page.read_text()
     drawn = re.findall(r"<figcaption>(\S+ \S+ \S+)", text)
     assert drawn == ["poses of the", "marks in the", "residuals of the"]
@@ -61,7 +55,7 @@ def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_p
     assert text.count('class="gauge"') == 7
     assert text.count('class="bar"') == 2 * 10
     assert "http" not in text.replace("http-equiv", "")
-    code, out, _ = run(capsys, "check", str(session_file), "--json")
+    code, out, _ = calibrate(capsys, "check", str(session_file), "--json")
     data = json.loads(out)
     assert code == 0
     assert data["grade"] == "pass"
@@ -79,7 +73,7 @@ def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_p
 @pytest.mark.requirement("A-43")
 def test_boards_are_written(capsys, tmp_path: Path, name: str, board: str) -> None:
     path = tmp_path / "new" / name
-    code, out, _ = run(capsys, "board", str(path), "--board", board)
+    code, out, _ = calibrate(capsys, "board", str(path), "--board", board)
     assert code == 0
     assert path.stat().st_size > 500
     assert "mm" in out
@@ -94,11 +88,11 @@ def test_wrong_intrinsics_are_found_with_the_mount(capsys, tmp_path: Path) -> No
     known.samples.head = head.model_copy(update={"intrinsics": (width, height, 1.03 * fx, 1.03 * fy, cx, cy)})
     path = tmp_path / "wrong.npz"
     known.samples.save(path)
-    code, _, err = run(capsys, "solve", str(path))
+    code, _, err = calibrate(capsys, "solve", str(path))
     assert code == 1
     assert "are these its intrinsics?" in err
     report = tmp_path / "report.json"
-    code, out, err = run(capsys, "solve", str(path), "--free-intrinsics", "--json", str(report))
+    code, out, err = calibrate(capsys, "solve", str(path), "--free-intrinsics", "--json", str(report))
     assert code == 0, err
     assert "fx " in out
     data = json.loads(report.read_text())
@@ -116,7 +110,7 @@ def test_a_stored_file_that_would_run_something_is_reported_and_not_run(capsys, 
     (store / "wrist.yaml").write_text("!!python/object/apply:os.system ['touch " + str(tmp_path / "ran") + "']")
     (store / "overhead.yaml").write_text("format: 1\ncamera: over")
     (store / "..wrist.yaml").write_text("camera: ..wrist")
-    code, out, err = run(capsys, "list")
+    code, out, err = calibrate(capsys, "list")
     assert code == 1
     assert "wrist.yaml" in err
     assert "overhead.yaml" in err
@@ -169,7 +163,7 @@ def test_wrong_calls_say_what_is_wrong(
     capsys, session_file: Path, tmp_path: Path, monkeypatch, argv: list[str], code: int, words: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    got, _, err = run(capsys, *[str(session_file) if word == "SESSION" else word for word in argv])
+    got, _, err = calibrate(capsys, *[str(session_file) if word == "SESSION" else word for word in argv])
     assert got == code, err
     assert words in err
     assert "Traceback" not in err
@@ -179,7 +173,7 @@ def test_wrong_calls_say_what_is_wrong(
 @pytest.mark.requirement("A-41")
 def test_a_degenerate_session_is_exit_code_1_with_advice(capsys, session_file: Path) -> None:
     names = [f"s{k:03d}" for k in range(3, 11)]
-    code, _, err = run(capsys, "solve", str(session_file), *[word for n in names for word in ("--exclude", n)])
+    code, _, err = calibrate(capsys, "solve", str(session_file), *[word for n in names for word in ("--exclude", n)])
     assert code == 1
     assert "DEGENERATE: too few poses: 2" in err
 
@@ -188,10 +182,10 @@ def test_a_degenerate_session_is_exit_code_1_with_advice(capsys, session_file: P
 def test_sessions_of_both_cameras_are_solved_together(capsys, session_file: Path, tmp_path: Path) -> None:
     other = tmp_path / "overhead.npz"
     make_session("to_hand", 12).samples.save(other)
-    code, out, err = run(capsys, "together", str(session_file), str(other), "--save", "--json")
+    code, out, err = calibrate(capsys, "together", str(session_file), str(other), "--save", "--json")
     assert code == 0, err
     assert list(json.loads(out)["cameras"]) == ["wrist", "overhead"]
-    listed = run(capsys, "list")[1]
+    listed = calibrate(capsys, "list")[1]
     assert "overhead: " in listed
     assert "wrist: " in listed
 
@@ -230,7 +224,7 @@ def test_auto_takes_the_fixed_camera_first_and_reports_the_results(
         return calibration.CalibrationRun(tmp_path, results, 1.0, error)
 
     monkeypatch.setattr(calibration, "run_calibration", run_it)
-    got, out, _ = run(capsys, "auto", "--mount-seed", "3", "--poses", "12", "--save", "--json")
+    got, out, _ = calibrate(capsys, "auto", "--mount-seed", "3", "--poses", "12", "--save", "--json")
     assert got == code
     data = json.loads(out)
     assert words in f"{data['code']}: {data['message']}"

@@ -16,7 +16,6 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from openarm_bringup import cli
 from openarm_bringup.bags.bag import BagWriter
 from openarm_bringup.bags.ros.listener import from_profile
 from openarm_calibration.board.board import read_board
@@ -26,6 +25,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, ns_to_stamp
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+from tests.openarm_bringup.commands import calibrate
 from tests.openarm_calibration import foreign_files as files
 from tests.openarm_calibration import known_session
 
@@ -90,12 +90,6 @@ def record(path: Path, known: files.Truth, topics: tuple[str, ...], lens: np.nda
     return path
 
 
-def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
-    code = cli.run(["calibrate", *argv])
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
 @pytest.fixture(scope="module")
 def known() -> files.Truth:
     return files.truth("in_hand", PLACES, seed=2)
@@ -119,12 +113,12 @@ def test_a_bag_of_another_robot_with_a_lens_is_solved_and_its_session_too(capsys
     """URDF of the bag, CompressedImage, rational_polynomial, joint states of two drivers."""
     session = tmp_path / "eye.npz"
     argv = ("--camera-kind", "eye_in_hand", "--tip", "ur_tool", "--board", BOARD, "--session", str(session))
-    code, out, err = run(capsys, "import", str(bag), *argv, "--store", str(tmp_path), "--json")
+    code, out, err = calibrate(capsys, "import", str(bag), *argv, "--store", str(tmp_path), "--json")
     assert code == 0, err
     data = json.loads(out)
     assert [row["sample"] for row in data["stills"]] == [f"s{k + 1:03d}" for k in range(PLACES)]
     assert off(data, known) < 2e-4
-    code, out, err = run(capsys, "solve", str(session), "--store", str(tmp_path), "--json")
+    code, out, err = calibrate(capsys, "solve", str(session), "--store", str(tmp_path), "--json")
     assert code == 0, err
     assert off(json.loads(out), known) < 2e-4
 
@@ -160,6 +154,6 @@ TIP = ("--camera-kind", "eye_in_hand", "--tip", "ur_tool")
     ],
 )
 def test_wrong_calls_say_what_there_is(capsys, bag: Path, argv, words: str) -> None:
-    code, _, err = run(capsys, "import", str(bag), *argv)
+    code, _, err = calibrate(capsys, "import", str(bag), *argv)
     assert code == 2, err
     assert words in err

@@ -18,6 +18,7 @@ from openarm_calibration.store.store import CalibrationStore
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.robot.description import RobotDescription
+from tests.openarm_bringup.commands import calibrate
 from tests.openarm_calibration import foreign_files as files
 
 pytestmark = [pytest.mark.requirement("R-14"), pytest.mark.usefixtures("own_store")]
@@ -25,12 +26,6 @@ pytestmark = [pytest.mark.requirement("R-14"), pytest.mark.usefixtures("own_stor
 BOARD = "charuco:7x5:34mm:26mm:DICT_6X6_250"
 RATIONAL = np.array([0.2, -0.1, 0.001, -0.0005, 0.02, 0.35, -0.05, 0.01])
 PLUMB_BOB = np.array([-0.25, 0.06, 0.001, 0.0005, 0.0])
-
-
-def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
-    code = cli.run(["calibrate", "import", *argv])
-    out, err = capsys.readouterr()
-    return code, out, err
 
 
 def off(data: dict, known: files.Truth) -> tuple[float, float]:
@@ -54,7 +49,9 @@ def test_pose_pairs_of_other_tools_are_solved_and_stored_by_one_command(
 ) -> None:
     known = files.truth("in_hand" if kind == "eye_in_hand" else "to_hand", 15, 2e-4, 4e-4)
     path = writer(tmp_path / name, known)
-    code, out, err = run(capsys, str(path), "--camera-kind", kind, "--camera", "cam", "--save", "--json")
+    code, out, err = calibrate(
+        capsys, "import", str(path), "--camera-kind", kind, "--camera", "cam", "--save", "--json"
+    )
     assert code == 0, err
     data = json.loads(out)
     assert off(data, known)[0] < 1e-3
@@ -69,11 +66,11 @@ def test_pose_pairs_of_other_tools_are_solved_and_stored_by_one_command(
 def test_the_kind_that_a_file_of_easy_handeye2_states_is_used_and_a_missing_one_asked_for(capsys, tmp_path) -> None:
     known = files.truth("to_hand")
     path = files.easy_handeye2(tmp_path / "a.samples", known, "eye_on_base")
-    code, out, _ = run(capsys, str(path), "--json")
+    code, out, _ = calibrate(capsys, "import", str(path), "--json")
     assert code == 0
     assert off(json.loads(out), known)[0] < 1e-5
     path = files.easy_handeye2(tmp_path / "b.samples", known)
-    code, _, err = run(capsys, str(path))
+    code, _, err = calibrate(capsys, "import", str(path))
     assert code == 2
     assert "give --camera-kind eye_in_hand or eye_to_hand" in err
 
@@ -108,7 +105,7 @@ def test_a_csv_and_a_folder_of_images_are_solved_with_the_convention_found(
         "--camera-kind", f"eye_{setup}", "--images", str(tmp_path / "images"), "--board", BOARD,
         "--intrinsics", info(tmp_path / "cam.yaml", lens), "--session", str(session),
     )  # fmt: skip
-    code, out, err = run(capsys, str(path), *argv, "--json")
+    code, out, err = calibrate(capsys, "import", str(path), *argv, "--json")
     assert code == 0, err
     data = json.loads(out)
     assert off(data, known)[0] < 2e-4
@@ -204,7 +201,7 @@ HAND = ("--camera-kind", "eye_in_hand")
 def test_wrong_calls_and_hostile_files_end_in_a_sentence(capsys, made: Path, monkeypatch, argv, code, words) -> None:
     monkeypatch.chdir(made)
     before = sorted(made.iterdir())
-    got, out, err = run(capsys, *argv)
+    got, out, err = calibrate(capsys, "import", *argv)
     assert got == code, err
     assert words in err
     assert "Traceback" not in out + err

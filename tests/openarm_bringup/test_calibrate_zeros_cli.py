@@ -57,7 +57,7 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("count", "folds"), [(8, 2), pytest.param(14, 5, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("count", "folds"), [(8, 2), (14, 5)])
 @pytest.mark.requirement("R-11")
 def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_back(
     capsys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int, folds: int
