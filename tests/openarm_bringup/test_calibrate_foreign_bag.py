@@ -128,7 +128,7 @@ def test_a_bag_without_a_description_is_solved_by_tf(capsys, known, tmp_path: Pa
     """A raw image, no distortion, a chain of a moving and a static frame."""
     path = record(tmp_path / "bag", known, ("/eye/image", "/eye/camera_info", "/tf", "/tf_static"), None)
     argv = ("--camera-kind", "eye_in_hand", "--base", "ur_base", "--tip", "ur_tool", "--board", BOARD)
-    code, out, err = run(
+    code, out, err = calibrate(
         capsys, "import", str(path), *argv, "--joint-topic", "tf", "--store", str(tmp_path / "s"), "--json"
     )
     assert code == 0, err
