@@ -48,6 +48,7 @@ def test_a_fall_is_seen_wherever_the_samples_lie(phase: int) -> None:
 def test_a_hand_may_lower_and_a_restarted_simulation_may_move_an_object() -> None:
     lowered = [sample(k * _DT, 0.3 - 0.4 * k * _DT, -0.4) for k in range(10)]
     assert fall_of([sample(-_DT, 0.3), *lowered]) == 0.0
+    assert fall_of([sample(0.0, 0.3), sample(0.2, 0.1, -1.9)]) == 0.0  # what was between them is not known
     again = [sample(5.0, 0.3), sample(0.0, 0.0), sample(0.1, 0.0)]
     assert fall_of(again) == 0.0
     assert since_reset(again) == again[1:]
