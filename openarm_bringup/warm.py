@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m openarm_bringup.warm`: compile every numba kernel once, so that no node waits for it at its first use."""
+"""`python -m openarm_bringup.warm`: compile the numba kernels once, so that no node waits for them."""
 
 from __future__ import annotations
 

@@ -59,7 +59,8 @@ class WaitSetExecutor(Executor):
     def add_node(self, node: Any) -> bool:
         """Run the callbacks of a node; return whether it is new here."""
         added = super().add_node(node)
-        self._let_go()
+        if added:  # rclpy calls this again within, with its lock held: nothing may be waited for then
+            self._let_go()
         return added
 
     def remove_node(self, node: Any) -> None:

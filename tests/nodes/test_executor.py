@@ -132,6 +132,10 @@ def test_what_is_made_destroyed_or_asked_by_another_thread_wakes_the_executor(ex
         done = threading.Event()
         node.create_timer(0.01, done.set)
         assert done.wait(DEADLINE_S)
+        other, added = Node("other"), threading.Event()
+        other.create_timer(0.01, added.set)
+        assert executor.add_node(other)
+        assert added.wait(DEADLINE_S)
         asked = executor.create_task(lambda: "done")
         end = time.monotonic() + DEADLINE_S
         while not asked.done():
@@ -151,6 +155,7 @@ def test_what_is_made_destroyed_or_asked_by_another_thread_wakes_the_executor(ex
             time.sleep(0.01)
     executor.shutdown(2.0)
     spinning.join(DEADLINE_S)
+    other.destroy_node()
     assert not spinning.is_alive()
 
 
