@@ -22,6 +22,7 @@ from openarm_bringup.supervision.state import state_dir
 from openarm_common.domain import reserve_domain
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_grasp.ros.client import GraspClient
+from tests.conftest import DEADLINE_S
 
 ROOT = Path(__file__).parents[2]
 
@@ -48,7 +49,7 @@ class Up:
         graphs = [graph for graph in json.loads(done.stdout)["graphs"] if graph["pid"] == self.process.pid]
         return graphs[0] if graphs else None
 
-    def wait_ready(self, seconds: float = 60.0) -> RunRecord:
+    def wait_ready(self, seconds: float = DEADLINE_S) -> RunRecord:
         """Wait until all nodes are ready; return what the supervisor has recorded."""
         written = state_dir(self.env) / f"{self.process.pid}.json"
         deadline = time.monotonic() + seconds
@@ -64,7 +65,7 @@ class Up:
         written = state_dir(self.env) / f"{self.process.pid}.json"
         return RunRecord.model_validate_json(written.read_text()).nodes[name]
 
-    def wait_back(self, name: str, killed: int, seconds: float = 60.0) -> None:
+    def wait_back(self, name: str, killed: int, seconds: float = DEADLINE_S) -> None:
         """Wait until a node that was killed runs in another process, and is ready."""
         deadline = time.monotonic() + seconds
         while (node := self.node(name)).pid == killed or node.state != "ready":

@@ -19,8 +19,6 @@ import rclpy
 from geometry_msgs.msg import Point
 from openarm_interfaces.srv import ClearFaults, Grasp, InjectFault, QueryMap
 from rcl_interfaces.srv import ListParameters
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from tf2_msgs.msg import TFMessage
 
@@ -37,6 +35,7 @@ from openarm_evaluation.judging.judge import JudgeConfig, judge
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import run_pair, wait_scene
 from openarm_grasp.ros.client import GraspClient
+from tests.conftest import DEADLINE_S
 from tests.graph import contract
 from tests.graph.asking import Asked
 
@@ -56,7 +55,7 @@ def up(start_graph: Any) -> Any:
 
 @pytest.fixture(scope="class")
 def visitor(up: Any) -> Iterator[Node]:
-    """A node that looks at the graph, spun by tests; when nodes leave, Fast DDS may hold who stays (Fast-DDS#6502)."""
+    """A user's node, spun by tests; one for each: when nodes leave, Fast DDS may hold who stays (Fast-DDS#6502)."""
     rclpy.init(domain_id=up.domain)
     node = rclpy.create_node("visitor")
     try:
@@ -66,24 +65,17 @@ def visitor(up: Any) -> Iterator[Node]:
         rclpy.try_shutdown()
 
 
-def call(domain: int, kind: Any, name: str, /, **fields: object) -> Any:
+def call(node: Node, kind: Any, name: str, /, **fields: object) -> Any:
     """Call a service with rclpy alone, as a user's node does."""
-    context = Context()
-    rclpy.init(context=context, domain_id=domain)
-    node = rclpy.create_node("plain_user", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
+    client = node.create_client(kind, name)
     try:
-        service = node.create_client(kind, name)
-        assert service.wait_for_service(timeout_sec=60.0)
-        future = service.call_async(kind.Request(**fields))
-        executor.spin_until_future_complete(future, timeout_sec=240.0)
+        assert client.wait_for_service(timeout_sec=DEADLINE_S), f"{name} is not there"
+        future = client.call_async(kind.Request(**fields))
+        rclpy.spin_until_future_complete(node, future, timeout_sec=240.0)
         assert future.done(), f"no answer of {name}"
         return future.result()
     finally:
-        executor.shutdown()
-        node.destroy_node()
-        context.try_shutdown()
+        node.destroy_client(client)
 
 
 def waiting_plan(observer: Observer) -> str | None:
@@ -153,12 +145,8 @@ class TestInterfaces:
         stated = contract.stated_parameters()
         assert {"mujoco_bridge", "detector", "octomap", "motion", "grasp"} <= stated.keys()
         for node, names in stated.items():
-            client = visitor.create_client(ListParameters, f"/{node}/list_parameters")
-            assert client.wait_for_service(timeout_sec=60.0), node
-            answer = client.call_async(ListParameters.Request())
-            rclpy.spin_until_future_complete(visitor, answer, timeout_sec=60.0)
-            assert answer.done(), f"no answer of {node}"
-            assert names <= set(answer.result().result.names), node
+            answer = call(visitor, ListParameters, f"/{node}/list_parameters")
+            assert names <= set(answer.result.names), node
 
     @pytest.mark.requirement("P-31")
     def test_who_takes_images_unasked_is_a_lifecycle_node(self, visitor: Node) -> None:
@@ -196,8 +184,8 @@ class TestInterfaces:
 
 
 @pytest.mark.requirement("R-24")
-def test_unknown_object_is_refused_with_what_is_in_view_and_leaves_a_recording(up: Any, domain: int) -> None:
-    answer = call(domain, Grasp, "/grasp", label="unicorn")
+def test_unknown_object_is_refused_with_what_is_in_view_and_leaves_a_recording(up: Any, visitor: Node) -> None:
+    answer = call(visitor, Grasp, "/grasp", label="unicorn")
     assert not answer.success
     assert answer.code == Code.UNKNOWN_OBJECT
     assert "red" in answer.message
@@ -210,8 +198,8 @@ def test_unknown_object_is_refused_with_what_is_in_view_and_leaves_a_recording(u
 
 @pytest.mark.long
 @pytest.mark.requirement("R-24")
-def test_a_recording_of_a_failure_is_checked_and_replayed(up: Any, domain: int) -> None:
-    recording = call(domain, Grasp, "/grasp", label="unicorn").recording
+def test_a_recording_of_a_failure_is_checked_and_replayed(up: Any, visitor: Node) -> None:
+    recording = call(visitor, Grasp, "/grasp", label="unicorn").recording
     _, counts = kept_of(up, recording)
     checked = check(Path(recording))
     assert checked.success, checked.message
@@ -237,23 +225,23 @@ def test_dry_run_plans_and_moves_nothing(up: Any, observer: Observer) -> None:
 @pytest.mark.long
 @pytest.mark.requirement("A-32", "R-15")
 def test_with_wrong_intrinsics_a_grasp_is_refused_with_that_code_and_nothing_moves(
-    domain: int, observer: Observer
+    visitor: Node, observer: Observer
 ) -> None:
     wait_scene(observer, load_scene("demo"), 0)
     bias = "{camera: overhead, focal: 0.48}"
-    assert call(domain, InjectFault, "/sim/inject_fault", name="intrinsics_bias", parameters=bias).success
+    assert call(visitor, InjectFault, "/sim/inject_fault", name="intrinsics_bias", parameters=bias).success
     try:
         observer.forget()
-        answer = call(domain, Grasp, "/grasp", label="red")
+        answer = call(visitor, Grasp, "/grasp", label="red")
     finally:
-        assert call(domain, ClearFaults, "/sim/clear_faults").success
+        assert call(visitor, ClearFaults, "/sim/clear_faults").success
     assert answer.code == Code.INTRINSICS_MISMATCH, answer.message
     assert not {step.state for step in observer.steps()} & {"PLAN", "MOVE_TO_PREGRASP"}
 
 
 @pytest.mark.requirement("A-01", "B-06", "P-16", "P-20", "R-25")
 def test_a_confirmed_grasp_by_service_places_within_5_mm_around_what_only_the_map_knows_and_a_second_one_is_refused(
-    domain: int, observer: Observer, client: GraspClient
+    visitor: Node, observer: Observer, client: GraspClient
 ) -> None:
     """What fails without calibration, and without the map: `tests/openarm_evaluation/test_chain.py`.
 
@@ -264,16 +252,15 @@ def test_a_confirmed_grasp_by_service_places_within_5_mm_around_what_only_the_ma
     middle = Point(**dict(zip("xyz", scene.object("screen").centre(scene.table), strict=True)))
     middle.z += 0.09  # what the camera sees is the top
 
-    def mapped() -> bool:
-        answer = call(domain, QueryMap, "/octomap/query", points=[middle])
-        return answer.success and answer.states[0] == QueryMap.Response.OCCUPIED
+    def state() -> int | None:
+        answer = call(visitor, QueryMap, "/octomap/query", points=[middle])
+        return answer.states[0] if answer.success else None
 
-    observer.wait(mapped, 60.0, "the screen in the map")
+    occupied = QueryMap.Response.OCCUPIED
+    assert contract.until(visitor, state, lambda seen: seen == occupied) == occupied, "the screen in the map"
     place = Point(x=0.26, y=0.43)
-    request = Asked(
-        observer,
-        lambda: call(domain, Grasp, "/grasp", label="red", has_place_position=True, place_position=place, confirm=True),
-    )
+    fields = {"label": "red", "has_place_position": True, "place_position": place, "confirm": True}
+    request = Asked(observer, lambda: call(visitor, Grasp, "/grasp", **fields))
     plan_id = observer.wait(lambda: waiting_plan(observer), 60.0, "a plan that waits")
     assert "MOVE_TO_PREGRASP" not in {step.state for step in observer.steps()}
     assert client.confirm(plan_id, accept=True).raise_for_code()
