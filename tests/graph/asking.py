@@ -1,16 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A request that runs while a test watches what it does."""
+"""A user's node next to a running graph, and a request that runs while a test watches what it does."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from typing import Generic, TypeVar
 
+import rclpy
+from rclpy.node import Node
+
 from openarm_evaluation.judging.ros.observer import Observer
+from tests.conftest import DEADLINE_S
 
 T = TypeVar("T")
+
+
+@contextmanager
+def user(domain: int) -> Iterator[Node]:
+    """A node of rclpy alone, which the test spins."""
+    rclpy.init(domain_id=domain)
+    node = rclpy.create_node("plain_user")
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def until(node: Node, look: Callable[[], T], good: Callable[[T], object], seconds: float = DEADLINE_S) -> T:
+    """Spin until what is seen is good; return it, or what was seen last."""
+    deadline = time.monotonic() + seconds
+    while not good(seen := look()) and time.monotonic() < deadline:
+        rclpy.spin_once(node, timeout_sec=0.1)
+    return seen
 
 
 class Asked(Generic[T]):

@@ -4,19 +4,15 @@
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
-import rclpy
 from rclpy.action.graph import get_action_server_names_and_types_by_node
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from openarm_bringup.supervision.graph import load_graph
+from tests.graph.asking import until
 
-T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[2]
 INTERFACES = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
 ROW = re.compile(r"^\| `(/[^`]+)` \| `([^`]+/(?:msg|srv|action)/[^`]+)` \|(.*)\|$", re.MULTILINE)
@@ -40,14 +36,6 @@ STANDARD = (
     r"/_action/|/(describe|get|list|set)_parameter|get_type_description"
     r"|/get_available_(states|transitions)$|/get_transition_graph$"
 )
-
-
-def until(node: Node, look: Callable[[], T], good: Callable[[T], bool], seconds: float = 60.0) -> T:
-    """Spin until what is seen is good; return it, or what was seen last."""
-    deadline = time.monotonic() + seconds
-    while not good(seen := look()) and time.monotonic() < deadline:
-        rclpy.spin_once(node, timeout_sec=0.1)
-    return seen
 
 
 def settled(node: Node) -> dict[str, list[str]]:

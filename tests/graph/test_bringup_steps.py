@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import resource
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import psutil
@@ -14,8 +12,6 @@ import pytest
 import rclpy
 from control_msgs.action import ParallelGripperCommand
 from openarm_interfaces.action import MoveArm
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from vision_msgs.msg import Detection3DArray
@@ -23,34 +19,17 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.ros.actions import ActionClient
 from openarm_common.scene.scene import load_scene
+from tests.conftest import DEADLINE_S
+from tests.graph.asking import until, user
 
 pytestmark = [pytest.mark.graph, pytest.mark.long]
 
 
-@contextmanager
-def user(domain: int) -> Iterator[tuple[Node, SingleThreadedExecutor]]:
-    context = Context()
-    rclpy.init(context=context, domain_id=domain)
-    node = rclpy.create_node("plain_user", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    try:
-        yield node, executor
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        context.try_shutdown()
-
-
-def newest(node: Node, executor: SingleThreadedExecutor, kind: Any, topic: str, good: Any) -> Any:
+def newest(node: Node, kind: Any, topic: str, good: Any) -> Any:
     """Spin until a message of the topic is good; return it."""
     found: list[Any] = []
     subscription = node.create_subscription(kind, topic, lambda m: found.append(m) if good(m) else None, 10)
-    clock = node.get_clock()
-    deadline = clock.now().nanoseconds + 20 * 10**9
-    while not found:
-        executor.spin_once(timeout_sec=0.1)
-        assert clock.now().nanoseconds < deadline, f"nothing good on {topic}"
+    assert until(node, lambda: found, bool), f"nothing good on {topic}"
     node.destroy_subscription(subscription)
     return found[0]
 
@@ -59,15 +38,15 @@ def texts(markers: MarkerArray) -> list[Marker]:
     return [marker for marker in markers.markers if marker.type == Marker.TEXT_VIEW_FACING]
 
 
-def act(node: Node, executor: SingleThreadedExecutor, kind: Any, name: str, goal: Any) -> Any:
+def act(node: Node, kind: Any, name: str, goal: Any) -> Any:
     """Send a goal and return its result."""
     client = ActionClient(node, kind, name)
-    assert client.wait_for_server(timeout_sec=10.0)
+    assert client.wait_for_server(timeout_sec=DEADLINE_S)
     sent = client.send_goal_async(goal)
-    executor.spin_until_future_complete(sent, timeout_sec=10.0)
+    rclpy.spin_until_future_complete(node, sent, timeout_sec=DEADLINE_S)
     assert sent.result().accepted
     result = sent.result().get_result_async()
-    executor.spin_until_future_complete(result, timeout_sec=60.0)
+    rclpy.spin_until_future_complete(node, result, timeout_sec=DEADLINE_S)
     assert result.done()
     return result.result().result
 
@@ -82,13 +61,13 @@ def robot(start_graph: Any) -> Any:
 
 @pytest.mark.requirement("B-66")
 def test_step_1_robot_alone_publishes_its_joints_and_moves_a_gripper(robot: Any) -> None:
-    with user(robot.domain) as (node, executor):
-        state = newest(node, executor, JointState, "/joint_states", lambda m: len(m.name) == 16)
+    with user(robot.domain) as node:
+        state = newest(node, JointState, "/joint_states", lambda m: len(m.name) == 16)
         assert "openarm_left_joint1" in state.name
         goal = ParallelGripperCommand.Goal()
         goal.command.name = ["openarm_left_finger_joint1"]
         goal.command.position = [0.04]
-        result = act(node, executor, ParallelGripperCommand, "/left_gripper_controller/gripper_cmd", goal)
+        result = act(node, ParallelGripperCommand, "/left_gripper_controller/gripper_cmd", goal)
         assert result.reached_goal
         assert result.state.position[0] == pytest.approx(0.04, abs=0.002)
 
@@ -133,9 +112,9 @@ def test_step_2_every_object_is_seen_and_marked_where_it_stands(start_graph: Any
     up = start_graph("perception")
     up.wait_ready()
     scene = {item.label: item for item in load_scene("demo").objects}
-    with user(up.domain) as (node, executor):
-        seen = newest(node, executor, Detection3DArray, "/detections_3d", lambda m: len(m.detections) == len(scene))
-        drawn = newest(node, executor, MarkerArray, "/detection_markers", lambda m: len(texts(m)) == len(scene))
+    with user(up.domain) as node:
+        seen = newest(node, Detection3DArray, "/detections_3d", lambda m: len(m.detections) == len(scene))
+        drawn = newest(node, MarkerArray, "/detection_markers", lambda m: len(texts(m)) == len(scene))
     places = {d.results[0].hypothesis.class_id: d.bbox.center.position for d in seen.detections}
     for found in (places, {text.text.split()[0]: text.pose.position for text in texts(drawn)}):
         assert found.keys() == scene.keys()
@@ -149,24 +128,21 @@ def test_step_2_every_object_is_seen_and_marked_where_it_stands(start_graph: Any
 def test_step_3_an_arm_moves_to_a_posture_without_eyes(start_graph: Any) -> None:
     up = start_graph("motion")
     up.wait_ready()
-    with user(up.domain) as (node, executor):
-        state = newest(node, executor, JointState, "/joint_states", lambda m: len(m.name) == 16)
+    with user(up.domain) as node:
+        state = newest(node, JointState, "/joint_states", lambda m: len(m.name) == 16)
         names = [f"openarm_right_joint{i}" for i in range(1, 8)]
         now = dict(zip(state.name, state.position, strict=True))
         goal = MoveArm.Goal(arm="right", kind=MoveArm.Goal.JOINTS)
         goal.joint_positions = [now[name] for name in names]
         goal.joint_positions[6] += 0.3
-        result = act(node, executor, MoveArm, "/motion/move", goal)
+        result = act(node, MoveArm, "/motion/move", goal)
         assert result.success, f"{result.code}: {result.message}"
         newest(
             node,
-            executor,
             JointState,
             "/joint_states",
             lambda m: abs(m.position[m.name.index(names[6])] - goal.joint_positions[6]) < 0.01,
         )
-        home = act(
-            node, executor, MoveArm, "/motion/move", MoveArm.Goal(arm="right", kind=MoveArm.Goal.NAMED, named="home")
-        )
+        home = act(node, MoveArm, "/motion/move", MoveArm.Goal(arm="right", kind=MoveArm.Goal.NAMED, named="home"))
         assert home.success, f"{home.code}: {home.message}"
     assert up.stop() == 0

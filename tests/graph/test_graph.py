@@ -37,7 +37,7 @@ from openarm_evaluation.judging.trial import run_pair, wait_scene
 from openarm_grasp.ros.client import GraspClient
 from tests.conftest import DEADLINE_S
 from tests.graph import contract
-from tests.graph.asking import Asked
+from tests.graph.asking import Asked, until, user
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
@@ -56,13 +56,8 @@ def up(start_graph: Any) -> Any:
 @pytest.fixture(scope="class")
 def visitor(up: Any) -> Iterator[Node]:
     """A user's node, spun by tests; one for each: when nodes leave, Fast DDS may hold who stays (Fast-DDS#6502)."""
-    rclpy.init(domain_id=up.domain)
-    node = rclpy.create_node("visitor")
-    try:
+    with user(up.domain) as node:
         yield node
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
 
 
 def call(node: Node, kind: Any, name: str, /, **fields: object) -> Any:
@@ -138,7 +133,7 @@ class TestInterfaces:
             if "/msg/" not in kind
         }
         assert len(rows) >= 14
-        found = contract.until(visitor, lambda: contract.services(visitor), lambda found: found == rows)
+        found = until(visitor, lambda: contract.services(visitor), lambda found: found == rows)
         assert found == rows
 
     def test_parameters_exist_at_their_nodes(self, visitor: Node) -> None:
@@ -174,7 +169,7 @@ class TestInterfaces:
             visitor.create_subscription(TFMessage, "/tf_static", lambda m: note("/tf_static", m), QOS_STATIC_TF),
         ]
         wanted = {"overhead_color_optical_frame", "wrist_link", "openarm_right_hand_tcp", "openarm_left_link7", "table"}
-        contract.until(visitor, parents.keys, lambda found: wanted <= found)
+        until(visitor, parents.keys, lambda found: wanted <= found)
         for subscription in taken:
             visitor.destroy_subscription(subscription)
         assert wanted <= parents.keys()
@@ -257,7 +252,7 @@ def test_a_confirmed_grasp_by_service_places_within_5_mm_around_what_only_the_ma
         return answer.states[0] if answer.success else None
 
     occupied = QueryMap.Response.OCCUPIED
-    assert contract.until(visitor, state, lambda seen: seen == occupied) == occupied, "the screen in the map"
+    assert until(visitor, state, lambda seen: seen == occupied) == occupied, "the screen in the map"
     place = Point(x=0.26, y=0.43)
     fields = {"label": "red", "has_place_position": True, "place_position": place, "confirm": True}
     request = Asked(observer, lambda: call(visitor, Grasp, "/grasp", **fields))
