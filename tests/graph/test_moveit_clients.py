@@ -32,7 +32,10 @@ def test_every_program_of_the_library_does_what_it_should(start_graph: Any, robo
     up.wait_ready()
     command = [sys.executable, str(ROOT / "examples" / "moveit_programs.py"), "--json", *_NAMES[robot]]
 
-    done = subprocess.run(command, env=up.env, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
+    for _ in range(3):
+        done = subprocess.run(command, env=up.env, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
+        if "unexpected goal response" not in done.stderr:  # rclpy loses one that comes while it sends (ros2/rclpy#1123)
+            break
 
     up.stop()
     rows = [json.loads(line) for line in done.stdout.splitlines()]
