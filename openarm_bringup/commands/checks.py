@@ -109,10 +109,13 @@ def _in_order(tests: Path) -> list[str]:
 
 
 def _shared_out() -> list[str]:
-    """Return options that run tests in several processes, where there are processors for them."""
+    """Return options that run tests in several processes, where there are processors for them.
+
+    A process that crashes ends the run: xdist would start another one and then wait for ever for some of its tests.
+    """
     if len(os.sched_getaffinity(0)) == 1:
         return []
-    return ["-n", str(WORKERS), "--dist", "loadfile", "--no-loadscope-reorder"]
+    return ["-n", str(WORKERS), "--dist=loadfile", "--no-loadscope-reorder", "--max-worker-restart=0"]
 
 
 def _checkout() -> Path:
