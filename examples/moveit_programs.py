@@ -43,6 +43,8 @@ class Programs:
         self.arm = MoveIt2(node=node, callback_group=self.group, **names)
         self.by_action = MoveIt2(node=node, callback_group=self.group, use_move_group_action=True, **names)
         self.gripper = GripperInterface(node=node, callback_group=self.group, interface=MoveIt2Gripper, **gripper)
+        tip = names["end_effector_name"]
+        self.servo = MoveIt2Servo(node, tip, linear_speed=0.3, callback_group=self.group, enable_at_init=False)
         for arm in (self.arm, self.by_action):
             arm.max_velocity = arm.max_acceleration = 0.5
 
@@ -83,8 +85,8 @@ class Programs:
         return [body.id for body in scene.world.collision_objects], [body.object.id for body in attached]
 
     def close(self) -> None:
-        """Release what the library holds."""
-        for owner in (self.gripper, self.by_action, self.arm):
+        """Release what the library holds; rclpy 7.1 stops spinning when another thread destroys what it waits for."""
+        for owner in (self.servo, self.gripper, self.by_action, self.arm):
             owner.destroy()
 
     # --- the programs
@@ -265,21 +267,15 @@ class Programs:
     def servoed(self, send: Callable[[MoveIt2Servo], bool]) -> str:
         """Servo for half a second, and rest."""
         before = self.here()
-        with MoveIt2Servo(
-            self.node,
-            self.names["end_effector_name"],
-            linear_speed=0.3,
-            callback_group=self.group,
-            enable_at_init=False,
-        ) as servo:
-            if not servo.enable(sync=True):
-                raise RuntimeError("servoing was not started")
-            self.wait(lambda: send(servo))
-            for _ in range(50):
-                send(servo)
-                time.sleep(0.01)
-            if not servo.disable(sync=True):
-                raise RuntimeError("servoing was not stopped")
+        servo = self.servo
+        if not servo.enable(sync=True):
+            raise RuntimeError("servoing was not started")
+        self.wait(lambda: send(servo))
+        for _ in range(50):
+            send(servo)
+            time.sleep(0.01)
+        if not servo.disable(sync=True):
+            raise RuntimeError("servoing was not stopped")
         time.sleep(0.5)
         after = self.here()
         moved = max(abs(a - b) for x, y in zip(before, after, strict=True) for a, b in zip(x, y, strict=True))
