@@ -31,6 +31,7 @@ from openarm_evaluation.campaign.trial import Trials
 from openarm_evaluation.judging.trial import Step
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
+from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest
@@ -43,6 +44,8 @@ from tests.openarm_grasp.tape import Call, Tape, packed, unpacked
 
 #: What is asked for may differ by this from what was recorded, m and rad: rounding of another machine.
 _SAME = 1e-4
+#: So many of the ways that were offered must be offered again; of those at the edge of a limit, rounding decides.
+_MOST = 0.9
 
 
 def _asked(request: PlanGrasp | PlanPlace) -> tuple[list[Any], np.ndarray]:
@@ -55,6 +58,12 @@ def _asked(request: PlanGrasp | PlanPlace) -> tuple[list[Any], np.ndarray]:
     numbers += [part for way in ways for part in (way.approach_offset, way.retreat_offset)]
     numbers += [part for box in boxes for part in (box.T_frame_box[:3].ravel(), np.asarray(box.size))]
     return words, np.concatenate([*numbers, np.zeros(0)])
+
+
+def _ways(count: int, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of so many ways (count, 18) in what `_asked` returns, and those of the boxes."""
+    T, offsets, boxes = np.split(poses, (12 * count, 18 * count))
+    return np.hstack([T.reshape(count, 12), offsets.reshape(count, 6)]), boxes
 
 
 class SimulatedRobot(InProcessRobot):
@@ -224,15 +233,21 @@ class RecordedRobot:
 
     def _next(self, *what: Any, poses: Sequence[Any] | np.ndarray = ()) -> Call:
         """The next answer, which must be that to the same question."""
+        call = self._take(*what)
+        self._compare(what, call.what, np.asarray(poses, np.float64).ravel(), call.poses)
+        return call
+
+    def _take(self, *what: Any) -> Call:
         if self._calls == len(self.tape.calls):
             pytest.fail(f"the recording has no more answers; asked: {list(what)}")
-        call, asked = self.tape.calls[self._calls], np.asarray(poses, np.float64).ravel()
         self._calls += 1
-        if json.loads(json.dumps(what)) != call.what:
-            pytest.fail(f"asked: {list(what)}; when it was recorded: {call.what}")
-        if asked.shape != call.poses.shape or np.abs(asked - call.poses).max(initial=0.0) > _SAME:
-            pytest.fail(f"asked with other poses or sizes than when it was recorded: {list(what)}")
-        return call
+        return self.tape.calls[self._calls - 1]
+
+    def _compare(self, words: Sequence[Any], recorded: Sequence[Any], asked: np.ndarray, poses: np.ndarray) -> None:
+        if json.loads(json.dumps(words)) != recorded:
+            pytest.fail(f"asked: {list(words)}; when it was recorded: {recorded}")
+        if asked.shape != poses.shape or np.abs(asked - poses).max(initial=0.0) > _SAME:
+            pytest.fail(f"asked with other poses or sizes than when it was recorded: {list(words)}")
 
     async def _answer(self, call: Call, guard: Callable[[], None] | None = None) -> Any:
         faults: list[OpenArmError] = []
@@ -300,7 +315,31 @@ class RecordedRobot:
 
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         words, poses = _asked(request)
-        return await self._answer(self._next("plan", *words, poses=poses))
+        call = self._take("plan", *words)
+        if call.what[0] != "plan":
+            pytest.fail(f"asked for a plan; when it was recorded: {call.what}")
+        ids, before = words.pop(2), [*call.what[1:3], *call.what[4:]]
+        ids_before: list[str] = call.what[3]
+        (ways, boxes), (ways_before, boxes_before) = _ways(len(ids), poses), _ways(len(ids_before), call.poses)
+        self._compare(words, before, boxes, boxes_before)
+        # Where rounding lets a way more or less through, the ranks of others differ, and with them their ids.
+        apart = np.abs(ways_before[:, None] - ways[None]).max(axis=2, initial=0.0)
+        now = {k: int(row.argmin()) for k, row in enumerate(apart) if row.min(initial=np.inf) <= _SAME}
+        chosen = call.answer.chosen if call.error is None else None
+        if len(now) < _MOST * max(len(ids), len(ids_before)) or (chosen is not None and chosen not in now):
+            pytest.fail(f"asked for other ways, {len(now)} of them as recorded: {ids}; recorded: {ids_before}")
+        names = {ids_before[k]: ids[i] for k, i in now.items()}
+        try:
+            plan: Planned = await self._answer(call)
+        except NoWayError as error:
+            raise NoWayError(error.code, error.message, _renamed(error.refusals, names)) from None
+        margins = {i: plan.limit_margins[k] for k, i in now.items()} if plan.limit_margins else {}
+        return replace(
+            plan,
+            chosen=now[plan.chosen],
+            refusals=_renamed(plan.refusals, names),
+            limit_margins=tuple(margins.get(i, np.nan) for i in range(len(ids))) if margins else (),
+        )
 
     async def scene_version(self) -> int:
         return await self._answer(self._next("scene_version"))
@@ -319,6 +358,10 @@ class RecordedRobot:
 
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         return await self._answer(self._next("grip", arm, joint, what, poses=(position, effort)))
+
+
+def _renamed(refusals: Mapping[str, Verdict], names: Mapping[str, str]) -> dict[str, Verdict]:
+    return {names[way]: why for way, why in refusals.items() if way in names}
 
 
 class Requests:
