@@ -11,7 +11,7 @@ prints the worst of N runs for rtf, period, loss and latency, and the mean for c
     joint_state_period_p99_ms   between two joint states as they are published (wall clock of the publisher)
     joint_state_period_mean_ms  its mean
     frames_lost                 images whose stamp was seen on any topic of the camera, but not on this one
-    images_per_s                of all image topics together
+    images_per_s                of the slowest camera's topic that is slowest
     image_to_points_p95_ms      from the publication of the joint state with the image's stamp to the arrival of points
     cpu_cores                   of all processes of the graph, without the listener
 
@@ -113,13 +113,13 @@ def figures(data: dict[str, Any], seconds: float) -> dict[str, float]:
     wall = (joints[-1, 1] - joints[0, 1]) * 1e-9
     periods = np.diff(joints[:, 1]) * 1e-6
     heard = {topic: {s: t for s, t in got if first <= s <= last} for topic, got in data["heard"].items()}
-    lost = images = 0
+    lost, images = 0, list[int]()
     for camera in depth_cameras():
         topics = [f"/{camera}/{kind}/{what}" for kind in ("color", "depth") for what in ("image_raw", "camera_info")]
         published = set().union(*(heard[topic].keys() for topic in topics))
         for topic in topics[::2]:
             lost += len(published - heard[topic].keys())
-            images += len(heard[topic])
+            images.append(len(heard[topic]))
     at = {int(s): int(t) for s, t in joints}
     points = [t - at[s] for c in depth_cameras() for s, t in heard[f"/{c}/depth/points"].items() if s in at]
     return {
@@ -128,7 +128,7 @@ def figures(data: dict[str, Any], seconds: float) -> dict[str, float]:
         "joint_state_period_max_ms": float(periods.max()),
         "joint_state_period_mean_ms": float(periods.mean()),
         "frames_lost": float(lost),
-        "images_per_s": images / wall,
+        "images_per_s": min(images) / wall,
         "points_per_s": len(points) / wall,
         "image_to_points_p95_ms": float(np.percentile(points, 95)) * 1e-6 if points else float("inf"),
         "n": float(len(periods)),
@@ -144,7 +144,8 @@ def cpu_seconds(pid: int) -> dict[str, float]:
             times, line = one.cpu_times(), one.cmdline()
         except psutil.NoSuchProcess:
             continue
-        name = next((after for flag, after in pairwise(line) if flag == "-m"), Path(line[0]).name if line else "?")
+        module = next((after for flag, after in pairwise(line) if flag == "-m"), Path(line[0]).name if line else "?")
+        name = one.name() if module.endswith("fork_server") else module
         out[f"{name}[{one.pid}]"] = times.user + times.system
     return out
 
@@ -206,7 +207,7 @@ ROWS = (  # metric, unit, better, target (of rates: of what the cameras should s
     ("joint_state_period_max_ms", "ms", "lower", None, max),
     ("joint_state_period_mean_ms", "ms", "range", 10.0, max),
     ("frames_lost", "", "lower", 0.0, max),
-    ("images_per_s", "1/s", "higher", 0.99, min),
+    ("images_per_s", "1/s", "higher", 15.0, min),
     ("points_per_s", "1/s", "higher", 0.99, min),
     ("image_to_points_p95_ms", "ms", "lower", 60.0, max),
     ("cpu_cores", "", "lower", 1.8, max),
@@ -226,7 +227,7 @@ def main() -> None:
     args = parser.parse_args()
     choose_robot(args.robot)
     points = sum(camera.rate for camera in depth_cameras().values())
-    due = {"images_per_s": 2.0 * points, "points_per_s": points}
+    due = {"points_per_s": points}
     if args.watch:
         Path(args.watch).write_text(json.dumps(watch(args.seconds)))
         return

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Notice at once that a process of the same machine has ended, however it ended and however busy the machine is.
+"""Notice at once that a process of the same machine has ended, and soon that it hangs, however busy the machine is.
 
-The process listens on a Unix socket in the abstract namespace; the other connects, and reads its end when the kernel
-has closed it. Nothing is sent, and no connection has to be accepted. From another machine (or network namespace) there
-is no such socket: there a lease must do.
+The process listens on a Unix socket in the abstract namespace, and sends a byte now and then to whoever has connected;
+the kernel ends the connections when the process ends. From another machine (or network namespace) there is no such
+socket: there discovery must do, which forgets a participant whose lease is over.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
 from collections.abc import Callable
 
-#: Connections that a lifeline may have, also those of processes that have ended: beyond it a lease must do.
-_WATCHERS = 4096
+#: Connections that wait to be accepted, also those of processes that have ended.
+_BACKLOG = 4096
 
 
 def _address(name: str) -> bytes:
@@ -26,40 +27,86 @@ class Lifeline:
 
     Args:
         name: Not used by any other at this time.
+
+    Raises:
+        OSError: It is used.
     """
 
     def __init__(self, name: str) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.setblocking(False)
         self._socket.bind(_address(name))
-        self._socket.listen(_WATCHERS)
+        self._socket.listen(_BACKLOG)
+        self._watchers: list[socket.socket] = []
+
+    def beat(self) -> None:
+        """Show that this process works."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self._watchers.append(self._socket.accept()[0])
+        for watcher in tuple(self._watchers):
+            try:
+                watcher.send(b".", socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+            except BlockingIOError:  # it has enough to read
+                continue
+            except OSError:
+                self._watchers.remove(watcher)
+                watcher.close()
 
     def close(self) -> None:
         """End it."""
-        self._socket.close()
+        for one in (self._socket, *self._watchers):
+            one.close()
+        self._watchers.clear()
 
 
-def lives(name: str) -> bool:
-    """Return whether there is a lifeline of that name on this machine; that of a stopped process is there, too."""
-    with socket.socket(socket.AF_UNIX) as connection:
-        connection.setblocking(False)
-        try:
-            connection.connect(_address(name))
-        except BlockingIOError:  # as many wait for it as it can have
-            return True
-        except OSError:
-            return False
-    return True
+class Watched:
+    """A process that is watched by its lifeline, in a thread.
+
+    Args:
+        connection: To the lifeline.
+        on_end: Called once when it ends, unless `close` was called before.
+
+    Attributes:
+        ended: Whether it has.
+    """
+
+    def __init__(self, connection: socket.socket, on_end: Callable[[], object]) -> None:
+        self.ended = False
+        self._connection, self._on_end = connection, on_end
+        self._closed = False
+        self._heard_at = time.monotonic()
+        threading.Thread(target=self._listen, name="lifeline", daemon=True).start()
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the last sign of life."""
+        with contextlib.suppress(OSError):  # this process may have rested itself
+            if self._connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT):
+                return 0.0
+        return time.monotonic() - self._heard_at
+
+    def close(self) -> None:
+        """Watch no longer."""
+        self._closed = True
+        with contextlib.suppress(OSError):  # it has ended by itself
+            self._connection.shutdown(socket.SHUT_RDWR)
+
+    def _listen(self) -> None:
+        with self._connection, contextlib.suppress(OSError):
+            while self._connection.recv(64):
+                self._heard_at = time.monotonic()
+        if not self._closed:
+            self.ended = True
+            self._on_end()
 
 
-def watch(name: str, ended: Callable[[], object]) -> Callable[[], None] | None:
-    """Call a function, in a thread, when a lifeline ends.
+def watch(name: str, on_end: Callable[[], object] = lambda: None) -> Watched | None:
+    """Watch a lifeline of this machine; None when there is none of that name.
 
     Args:
         name: Of the lifeline.
-        ended: Called once, unless the watch has ended before.
-
-    Returns:
-        Ends the watch; None when there is no such lifeline on this machine.
+        on_end: Called in a thread when it ends.
     """
     connection = socket.socket(socket.AF_UNIX)
     connection.setblocking(False)
@@ -69,18 +116,4 @@ def watch(name: str, ended: Callable[[], object]) -> Callable[[], None] | None:
         connection.close()
         return None
     connection.setblocking(True)
-    over = threading.Event()
-
-    def wait() -> None:
-        with connection, contextlib.suppress(OSError):
-            connection.recv(1)
-        if not over.is_set():
-            ended()
-
-    def end() -> None:
-        over.set()
-        with contextlib.suppress(OSError):  # it has ended by itself
-            connection.shutdown(socket.SHUT_RDWR)
-
-    threading.Thread(target=wait, name="lifeline", daemon=True).start()
-    return end
+    return Watched(connection, on_end)

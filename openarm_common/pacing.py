@@ -25,21 +25,11 @@ class Pacer:
     """
 
     def __init__(self, period_ns: int, speed: float = 1.0, max_debt_ns: int = 500_000_000) -> None:
-        self._period_ns = period_ns
-        self.speed = speed
+        #: Of wall time; 0: as fast as possible.
+        self._step_ns = round(period_ns / speed) if speed > 0.0 else 0
         self._max_debt_ns = max_debt_ns
         self._due_ns: int | None = None
         self.skipped_ns = 0
-
-    @property
-    def speed(self) -> float:
-        """Simulated seconds per second of wall time from the next tick on; 0 is as fast as possible."""
-        return self._speed
-
-    @speed.setter
-    def speed(self, speed: float) -> None:
-        self._speed = speed
-        self._step_ns = round(self._period_ns / speed) if speed > 0.0 else 0
 
     def wait_ns(self, now_ns: int) -> int:
         """Return the time until the next tick is due; 0 or less when it is."""
@@ -61,36 +51,28 @@ class Pacer:
         self._due_ns = None
 
 
-class AdaptiveSpeed:
-    """Speed at which what follows a simulation keeps up: additive increase, multiplicative decrease.
-
-    On a machine that is too slow for real time, simulated time goes slower, as in other simulators: messages come in
-    order and none too late, where they would else be lost and each node would find the others behind.
+class AdaptiveShare:
+    """Share of the frames that a consumer keeps up with: additive increase, multiplicative decrease.
 
     Source: Chiu and Jain, Analysis of the increase and decrease algorithms for congestion avoidance (1989).
-
-    Args:
-        most: Simulated seconds per second of wall time when all keep up.
     """
 
-    #: A larger share of lost frames than this slows the simulation down.
+    #: A larger share of lost frames than this is too much.
     _LOST = 0.1
-    _LEAST, _FASTER, _SLOWER = 0.2, 0.01, 0.9
+    _LEAST, _MORE, _LESS = 0.1, 0.01, 0.9
 
-    def __init__(self, most: float) -> None:
-        self._most = self._speed = most
+    def __init__(self) -> None:
+        self._share = 1.0
         self._made = self._lost = 0
 
     def update(self, made: int, lost: int) -> float:
-        """Return the speed, by all frames that were made and lost so far; to be called at an even rate."""
+        """Return the share, by all frames that were made and lost so far; to be called at an even rate."""
         more, fewer = made - self._made, lost - self._lost
         self._made, self._lost = made, lost
         if more + fewer > 0:
-            if fewer > self._LOST * (more + fewer):
-                self._speed = max(self._LEAST * self._most, self._SLOWER * self._speed)
-            else:
-                self._speed = min(self._most, self._speed + self._FASTER * self._most)
-        return self._speed
+            too_many = fewer > self._LOST * (more + fewer)
+            self._share = max(self._LEAST, self._LESS * self._share) if too_many else min(1.0, self._share + self._MORE)
+        return self._share
 
 
 class RateDivider:

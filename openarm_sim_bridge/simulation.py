@@ -77,15 +77,6 @@ class Simulation(ControlLoop):
         return self._paused
 
     @property
-    def speed(self) -> float:
-        """Simulated seconds per second of wall time that it is paced at; 0 is as fast as possible."""
-        return self._pacer.speed
-
-    def set_speed(self, speed: float) -> None:
-        """Pace it otherwise from the next tick on. For speeds of at most 1; may be called from any thread."""
-        self._pacer.speed = speed
-
-    @property
     def skipped_s(self) -> float:
         """Wall time that was given up because the machine was too slow, s."""
         return self._pacer.skipped_ns * 1e-9

@@ -15,7 +15,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from openarm_bringup.supervision import environment, shm
-from openarm_bringup.supervision.process import NodeProcess
+from openarm_bringup.supervision.process import NodeProcess, command
 from openarm_bringup.supervision.state import is_private, socket_path
 from openarm_common.errors import OpenArmError
 
@@ -97,7 +97,7 @@ class Activation:
                 self._asked.clear()
             try:
                 async with supervisor.spawning:
-                    process = await NodeProcess.start(argv, env, log, pass_fds=(listener.fileno(),))
+                    process = await NodeProcess.start(command(argv, env, pass_fds=[listener.fileno()]), log)
                     self._process = process
                     supervisor.tell_guard(f"+{process.pid}")
                 code = await process.wait()

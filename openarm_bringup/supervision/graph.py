@@ -32,8 +32,8 @@ ConditionKind = Literal["topic", "message", "service", "action"]
 VARIABLES = ("scene", "seed", "mount_seed")
 #: Modules of the suite begin with this.
 _SUITE = "openarm_"
-#: Parameters that rclpy declares for every node.
-_OF_ROS = ("use_sim_time", "qos_overrides.")
+#: Parameters that every node has, of rclpy or of `BaseNode`.
+_OF_ROS = ("use_sim_time", "qos_overrides.", "executor")
 
 
 class Ready(Config):
@@ -63,13 +63,13 @@ class Restart(Config):
     """What happens when a node ends by itself."""
 
     policy: Literal["never", "on_failure", "always"] = "on_failure"
-    backoff: float = Field(default=0.5, gt=0, description="s before the first restart; doubles with each one")
+    backoff: float = Field(default=0.1, gt=0, description="s before a restart; doubles while the node fails soon")
     backoff_max: float = Field(default=8.0, gt=0, description="s, the longest wait")
     max: int = Field(default=5, ge=0, description="restarts before the node is given up")
     retry: float = Field(
         default=30.0, gt=0, description="s until a node that was given up is tried again, if the graph goes on"
     )
-    forget_after: float = Field(default=60.0, gt=0, description="s of being ready that make up for earlier restarts")
+    forget_after: float = Field(default=10.0, gt=0, description="s of being ready that make up for earlier restarts")
 
 
 class NodeSpec(Config):

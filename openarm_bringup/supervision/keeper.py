@@ -7,12 +7,13 @@ import asyncio
 import time
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from openarm_bringup.suggest import unknown
-from openarm_bringup.supervision import environment, ports, shm
+from openarm_bringup.supervision import environment, shm
 from openarm_bringup.supervision.graph import Ready
 from openarm_bringup.supervision.process import NodeProcess
+from openarm_common import ports
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 
 #: A node without a sign of life for so long hangs, s; asked for with this period, s.
 _HANGS_S, _LOOK_S = 10.0, 2.0
+#: A node that was ready for so many times the pause before its start is started again without a longer one.
+_WORKED = 10.0
+#: Period in which is noted what a node uses that is not ready yet, s.
+_NOTE_S = 1.0
 
 
 class Probe(Protocol):
@@ -106,7 +111,9 @@ class Keeper:
                 self._enter(NodeState.EXITED, why)
                 return
             if ready_s > policy.forget_after:
-                self.restarts, pause = 0, policy.backoff
+                self.restarts = 0
+            if ready_s > _WORKED * pause:
+                pause = policy.backoff
             # A node that was never ready fails for a reason that a second try will not remove.
             if policy.policy == "never" or not self._was_ready:
                 raise self._given_up(why)
@@ -139,21 +146,21 @@ class Keeper:
     async def _run_once(self) -> tuple[int, str, float]:
         """Run the process until it ends; return its exit code, why it ended, and how long it was ready, s."""
         supervisor, conditions = self._supervisor, self.spec.ready
-        argv = environment.node_arguments(supervisor.graph, self.name, supervisor.run_dir)
-        env = environment.node_environment(supervisor.graph, self.name, supervisor.run_dir)
+        start = supervisor.starting(self.name)
         # Endpoints of a killed process linger in discovery; only those of the new one count.
         old = await supervisor.ask(lambda probe: probe.known(conditions)) if self._was_ready else frozenset[str]()
         async with supervisor.spawning:
             if supervisor.stop_asked.is_set():
                 raise asyncio.CancelledError
-            self.process = process = await NodeProcess.start(argv, env, self.log)
+            self.process = process = await NodeProcess.start(start, self.log)
             self._ports = frozenset()
             supervisor.tell_guard(f"+{process.pid}")
         self._enter(NodeState.STARTING, f"pid {process.pid}")
         began = time.monotonic()
         ended = asyncio.create_task(process.wait())
         getting_ready = asyncio.create_task(self._get_ready(old))
-        tasks, why = [ended, getting_ready], ""
+        tasks: list[asyncio.Task[Any]] = [ended, getting_ready]
+        why = ""
         try:
             await asyncio.wait(
                 {ended, getting_ready}, timeout=self.spec.ready_timeout, return_when=asyncio.FIRST_COMPLETED
@@ -185,15 +192,16 @@ class Keeper:
         if code:
             # It may not have taken leave of the others; its segments would take space that the next start needs.
             supervisor.ports.hold(self._ports)
-            supervisor.say(await asyncio.to_thread(shm.clean_shm))
+            supervisor.say(f"removed from /dev/shm: {', '.join(shm.discard(self.mapped)) or 'nothing'}")
         return code, why or (f"ended by signal {-code}" if code < 0 else f"ended with code {code}"), ready_s
 
     async def _get_ready(self, old: frozenset[str]) -> None:
-        conditions = self.spec.ready
+        conditions, noted_at = self.spec.ready, time.monotonic()
         while conditions and await self._supervisor.ask(lambda probe: probe.unmet(conditions, old)):
             await asyncio.sleep(self._supervisor.poll)
-            if self.process is not None:
+            if self.process is not None and time.monotonic() - noted_at > _NOTE_S:
                 self._note_what_it_uses(self.process.pid)
+                noted_at = time.monotonic()
         if conditions and self.spec.params and not self._was_ready:
             await self._check_parameters()
 

@@ -8,7 +8,7 @@ import contextlib
 import os
 import signal
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import psutil
@@ -32,55 +32,81 @@ class Ladder:
         self.hurried = asyncio.Event()
 
 
-class NodeProcess:
-    """A running child; everything it prints goes to a log file, whether or not that takes it."""
+#: Starts a process that prints to a file, and returns its id.
+Start = Callable[[int], Awaitable[int]]
 
-    def __init__(self, process: asyncio.subprocess.Process, log: LogFile) -> None:
-        self._process = process
+
+def command(argv: Sequence[str], env: Mapping[str, str], *, pass_fds: Sequence[int] = ()) -> Start:
+    """Start a program in a session of its own.
+
+    Args:
+        argv: The program, which PATH may lead to, and its arguments.
+        env: Its whole environment.
+        pass_fds: Open files that it inherits.
+    """
+
+    async def start(output: int) -> int:
+        streams = [(os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0)]
+        streams += [(os.POSIX_SPAWN_DUP2, output, stream) for stream in (1, 2)]
+        streams += [(os.POSIX_SPAWN_DUP2, file, file) for file in pass_fds]  # inherited, as it is not without this
+        try:
+            # What Python ignores, a program is to begin with.
+            return os.posix_spawnp(argv[0], [*argv], env, file_actions=streams, setsid=True, setsigdef=[signal.SIGPIPE])
+        except OSError as error:
+            raise OpenArmError(Code.ENVIRONMENT, f"{argv[0]} could not be started: {error}") from error
+
+    return start
+
+
+class NodeProcess:
+    """A running child; everything it prints goes to a log file, whether or not that takes it.
+
+    It has a session of its own, so that signals reach its whole group and none from the terminal do.
+    """
+
+    def __init__(self, pid: int, output: asyncio.StreamReader, log: LogFile) -> None:
+        #: Process id, which is also the id of its group.
+        self.pid = pid
         self._log = log
         log.write(())  # a node that says nothing has one too
         self.tail: deque[str] = deque(maxlen=40)
         self.killed = False
-        self._pump = asyncio.create_task(self._copy_output())
+        self._pump = asyncio.create_task(self._copy(output))
+        self._loop = asyncio.get_running_loop()
+        self._ended: asyncio.Future[int] = self._loop.create_future()
+        self._handle = os.pidfd_open(pid)
+        self._loop.add_reader(self._handle, self._reap)
 
     @classmethod
-    async def start(
-        cls, argv: Sequence[str], env: Mapping[str, str], log: LogFile, *, pass_fds: Sequence[int] = ()
-    ) -> NodeProcess:
-        """Start a command in a new session, so that signals reach its whole group and none from the terminal do.
+    async def start(cls, start: Start, log: LogFile) -> NodeProcess:
+        """Start a process.
 
         Args:
-            argv: The command.
-            env: Its whole environment.
-            log: For what it prints.
-            pass_fds: Open files that it inherits.
+            start: Does it.
+            log: For what the process prints.
 
         Raises:
-            OpenArmError: ENVIRONMENT, when the command can't be started.
+            OpenArmError: ENVIRONMENT, when it can't be started.
         """
+        reader, writer = os.pipe()
+        output = asyncio.StreamReader()
+        await asyncio.get_running_loop().connect_read_pipe(
+            lambda: asyncio.StreamReaderProtocol(output), os.fdopen(reader, "rb", buffering=0)
+        )
         try:
-            process = await asyncio.create_subprocess_exec(
-                *argv,
-                env=dict(env),
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=asyncio.subprocess.PIPE,
-                stderr=asyncio.subprocess.STDOUT,
-                start_new_session=True,
-                pass_fds=pass_fds,
-            )
-        except OSError as error:
-            raise OpenArmError(Code.ENVIRONMENT, f"{argv[0]} could not be started: {error}") from error
-        return cls(process, log)
+            return cls(await start(writer), output, log)
+        finally:
+            os.close(writer)
 
-    @property
-    def pid(self) -> int:
-        """Process id, which is also the id of its group."""
-        return self._process.pid
+    def _reap(self) -> None:
+        self._loop.remove_reader(self._handle)
+        os.close(self._handle)
+        self._ended.set_result(os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1]))
 
     @property
     def returncode(self) -> int | None:
         """Exit code, minus the signal number, or None while it runs."""
-        return self._process.returncode
+        return self._ended.result() if self._ended.done() else None
 
     @property
     def stopped(self) -> bool:
@@ -97,7 +123,7 @@ class NodeProcess:
 
     async def wait(self) -> int:
         """Wait for the end of the process and of everything it has started; return its exit code."""
-        code = await self._process.wait()
+        code = await asyncio.shield(self._ended)
         await self._end_rest_of_group()
         try:
             await asyncio.wait_for(asyncio.shield(self._pump), 1.0)
@@ -115,30 +141,33 @@ class NodeProcess:
         return await self.wait()
 
     async def _ended_within(self, seconds: float, hurried: asyncio.Event) -> bool:
-        ended, haste = asyncio.create_task(self._process.wait()), asyncio.create_task(hurried.wait())
-        done, pending = await asyncio.wait({ended, haste}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-        for task in pending:
-            task.cancel()
-        return ended in done
+        haste = asyncio.create_task(hurried.wait())
+        await asyncio.wait({self._ended, haste}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        haste.cancel()
+        return self._ended.done()
 
     async def _end_rest_of_group(self) -> None:
         """Kill grandchildren that outlived the process; they had its signals already."""
         for _ in range(100):
+            self._bury_orphans()
             if not group_alive(self.pid):
                 return
             self.kill()
             await asyncio.sleep(0.02)
 
+    def _bury_orphans(self) -> None:
+        """Take note of the end of grandchildren: of a subreaper they are children."""
+        with contextlib.suppress(ChildProcessError):
+            while os.waitpid(-self.pid, os.WNOHANG)[0]:
+                pass
+
     def _signal(self, number: int) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, number)
 
-    async def _copy_output(self) -> None:
-        stream = self._process.stdout
-        if stream is None:
-            return
+    async def _copy(self, output: asyncio.StreamReader) -> None:
         rest = b""
-        while chunk := await stream.read(65536):
+        while chunk := await output.read(65536):
             *lines, rest = (rest + chunk).split(b"\n")
             if len(rest) > 1_000_000:  # a line that never ends must not grow without bound
                 lines, rest = [*lines, rest], b""

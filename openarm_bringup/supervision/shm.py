@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import NoReturn
 
 from openarm_bringup.supervision.graph import Graph
-from openarm_bringup.supervision.ports import in_domain, unicast
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ports import in_domain, unicast
 
 SHM = Path("/dev/shm")
 
 #: MiB of /dev/shm that a participant takes in addition to its large segment, measured.
-_PLAIN_MIB = 0.65
+_PLAIN_MIB = 1.2
 _LARGE_EXTRA_MIB = 2.2
 #: Largest factor by which segments grow, and the share of the free space that a graph may then take.
 _GROWTH, _SHARE = 4, 0.25
@@ -158,10 +158,21 @@ def sweep(names: Iterable[str], shm: Path = SHM) -> list[str]:
     knows a port; such ports would stay for ever.
     """
     removed = unused(names, shm)
-    for name in removed:
+    _remove(removed, shm)
+    return removed
+
+
+def _remove(names: Iterable[str], shm: Path) -> None:
+    for name in names:
         for part in (name, f"{name}_el", f"{name}_sl", f"sem.{name}_mutex"):
             (shm / part).unlink(missing_ok=True)
-    return removed
+
+
+def discard(names: Iterable[str], shm: Path = SHM) -> list[str]:
+    """Remove those of the named segments whose owner has died, for its successor to have room; return them."""
+    dead = [n for n in sorted(names) if _SEGMENT.fullmatch(n) and (shm / n).exists() and not _locked(shm / f"{n}_el")]
+    _remove(dead, shm)
+    return dead
 
 
 def leave(names: Iterable[str], code: int) -> NoReturn:

@@ -23,12 +23,13 @@ import psutil
 
 from openarm_bringup.supervision import environment, guard, runs, shm
 from openarm_bringup.supervision.activation import Activation
+from openarm_bringup.supervision.forking import ForkServer
 from openarm_bringup.supervision.graph import Graph
 from openarm_bringup.supervision.keeper import Keeper, NodeState, Probe
 from openarm_bringup.supervision.log import LogFile
-from openarm_bringup.supervision.ports import HeldPorts
-from openarm_bringup.supervision.process import Ladder
+from openarm_bringup.supervision.process import Ladder, Start, command
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ports import HeldPorts
 from openarm_common.robot.folder import robot_name
 
 T = TypeVar("T")
@@ -80,6 +81,7 @@ class Supervisor:
         self._threads = ThreadPoolExecutor(max_workers=1, thread_name_prefix="probe")
         self._watchers: list[asyncio.Task[None]] = []
         self._guard: asyncio.subprocess.Process | None = None
+        self._fork_server: ForkServer | None = None
         self.spawning = asyncio.Lock()
         self.stop_asked = asyncio.Event()
         self._hurrying: asyncio.Task[None] | None = None
@@ -113,6 +115,7 @@ class Supervisor:
             stdin=asyncio.subprocess.PIPE,
             start_new_session=True,
         )
+        await self._open_fork_server()
         self._open_probe()
         for keeper in self._keepers.values():
             watcher = asyncio.create_task(keeper.keep([self._keepers[need] for need in keeper.spec.needs]))
@@ -191,6 +194,8 @@ class Supervisor:
             # A node that is slow to end does not hold back the rest: its own ladder goes on meanwhile.
             await asyncio.wait(tasks, timeout=1.0)
         await asyncio.gather(*stops)
+        if self._fork_server is not None:
+            await self._fork_server.close()
         self.ports.close()
         mapped |= shm.mapped_by(os.getpid())
         self._threads.shutdown()
@@ -216,6 +221,20 @@ class Supervisor:
         if pid is None:
             raise OpenArmError(Code.NOT_READY, f"{node} is not running; it is {self._keepers[node].state}")
         return pid
+
+    async def _open_fork_server(self) -> None:
+        if not all(spec.foreign for spec in self.graph.nodes.values()):
+            env = environment.client_environment(self.graph, self.run_dir)
+            self._fork_server = await ForkServer.open(env, self.log_file("fork_server"))
+            self.tell_guard(f"+{self._fork_server.process.pid}")
+
+    def starting(self, name: str) -> Start:
+        """Return what starts the process of a node; writes its parameters and its Fast DDS profile."""
+        argv = environment.node_arguments(self.graph, name, self.run_dir)
+        env = environment.node_environment(self.graph, name, self.run_dir)
+        if self._fork_server is None or self.graph.nodes[name].foreign:
+            return command(argv, env)
+        return self._fork_server.node(name, argv, env)
 
     def _watcher_ended(self, keeper: Keeper, task: asyncio.Task[None]) -> None:
         error = None if task.cancelled() else task.exception()

@@ -1,72 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Servers that show that they live, and clients that notice within a lease when they do not.
+"""Servers that show that they live, and clients that notice when they do not.
 
-The status topic of an action, and the topic `~/_alive` of a node for its services, are offered with automatic
-liveliness: the middleware asserts it from a thread of its own, so a process that computes is alive, and one that was
-killed or stopped is not. On the same machine a lifeline tells the one from the other. A client whose server offers no
-liveliness (another vendor's) works as with rclpy's.
+A node of this machine shows it by a lifeline (`openarm_common.lifeline`), which its executor keeps beating: its end is
+noticed at once, and that it hangs within seconds. One of another machine is gone when discovery has forgotten it, at
+the end of its participant's lease. Servers without a lifeline (another vendor's) are watched as those.
 """
 
 from __future__ import annotations
 
-import math
-import time
+import threading
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
+from weakref import WeakSet
 
-from action_msgs.msg import GoalStatus, GoalStatusArray
+from action_msgs.msg import GoalStatus
 from rclpy import action
 from rclpy.clock import Clock, ClockType
-from rclpy.context import Context
-from rclpy.duration import Duration
-from rclpy.event_handler import QoSLivelinessChangedInfo, SubscriptionEventCallbacks
 from rclpy.executors import await_or_execute
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.lifeline import Lifeline, lives, watch
+from openarm_common.lifeline import Lifeline, Watched, watch
 
 #: What the middleware could not do.
 RCLError: type[Exception] = rclpy_implementation.RCLError
 
-
-@dataclass(frozen=True)
-class Lease:
-    """How fast the death of a publisher is noticed.
-
-    Attributes:
-        offered: s; Fast DDS asserts liveliness every two thirds of it.
-        accepted: s without an assertion after which the publisher counts as gone.
-    """
-
-    offered: float
-    accepted: float
-
-    def offer(self, profile: QoSProfile) -> QoSProfile:
-        """Let publishers with this profile show that they live."""
-        return _automatic(profile, self.offered)
-
-    def watch(self, profile: QoSProfile) -> QoSProfile:
-        """Let subscriptions with this profile notice when they do not."""
-        return _automatic(profile, self.accepted)
-
-
-#: Of servers, and owners of goals: three assertions have to be missing, so that a loaded machine raises no alarm. Each
-#: is a chance for Fast DDS to lock itself up for ever, while it removes an endpoint of another process (eProsima/
-#: Fast-DDS#6502): `openarm up` starts such a node again.
-LEASE = Lease(0.6, 1.3)
-
-
-def _automatic(profile: QoSProfile, seconds: float) -> QoSProfile:
-    profile.liveliness = LivelinessPolicy.AUTOMATIC
-    profile.liveliness_lease_duration = Duration(seconds=seconds)
-    return profile
+#: A process of this machine that lives and is silent for so long counts as gone, s: it is stopped, or hangs.
+_SILENT_S = 5.0
+#: Between two signs of life of a node, s.
+_BEAT_S = 0.5
+#: An answer that could not be sent is sent again after this, s: a try holds the node up for 0.1 s.
+_ANSWER_S = 0.5
+#: So often; DDS discovers a client that exists within some of them.
+_ANSWERS = 40
+#: On which every node publishes, so that its participant can be looked up.
+_OF_ALL_NODES = "/parameter_events"
+#: Lifelines of the participants of this process, and the nodes that keep them beating.
+_LIFELINES: dict[str, Lifeline] = {}
+_BEATING: WeakSet[Node] = WeakSet()
 
 
 def latest() -> QoSProfile:
@@ -79,52 +55,45 @@ def owner_topic(action_name: str) -> str:
     return f"{action_name.rpartition('/')[0]}/owner"
 
 
-def alive_topic(node_name: str) -> str:
-    """Return the hidden topic on which nothing is published: that its publisher is alive shows that the node is.
+def show_life(node: Node) -> None:
+    """Let clients of this machine notice at once when the process of a node ends, and soon when its executor hangs."""
+    if node in _BEATING:
+        return
+    _BEATING.add(node)
+    line: Lifeline | None = None
 
-    Args:
-        node_name: Fully qualified.
-    """
-    return f"{node_name}/_alive"
+    def beat() -> None:
+        nonlocal line
+        line = line or _own_lifeline(node)
+        if line is not None:
+            line.beat()
 
-
-#: A process of this machine that lives and is silent for so much longer than the lease counts as gone, s: it is
-#: stopped, or hangs. Fast DDS halts a process for a second or two when another one that it writes to was killed.
-_SILENT_S = 3.0
-#: An answer that could not be sent is sent again after this, s: a try holds the node up for 0.1 s.
-_ANSWER_S = 0.5
-#: So often; DDS discovers a client that exists within some of them.
-_ANSWERS = 40
-#: Lifelines of this process by participant of the middleware.
-_LIFELINES: dict[str, _ParticipantLifeline] = {}
+    beat()
+    node.create_timer(_BEAT_S, beat, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-class _ParticipantLifeline(Lifeline):
-    """Shows that the process of a participant lives, until its context shuts down."""
+def _own_lifeline(node: Node) -> Lifeline | None:
+    """Return the lifeline of a node's participant; None while that is not known, or where there can't be one."""
+    own = node.get_fully_qualified_name()
+    for info in node.get_publishers_info_by_topic(_OF_ALL_NODES):
+        if full_name(info) == own:
+            participant = _participant(info)
+            if participant not in _LIFELINES:
+                with suppress(OSError):  # without it, it is watched as one of another machine
+                    _LIFELINES[participant] = Lifeline(participant)
+                    node.context.on_shutdown(partial(_end, participant))
+            return _LIFELINES.get(participant)
+    return None
 
-    def __init__(self, participant: str, context: Context) -> None:
-        super().__init__(participant)
-        self._participant = participant
-        _LIFELINES[participant] = self
-        context.on_shutdown(self.end)
 
-    def end(self) -> None:
-        _LIFELINES.pop(self._participant, None)
-        self.close()
+def _end(participant: str) -> None:
+    if (line := _LIFELINES.pop(participant, None)) is not None:
+        line.close()
 
 
-def show_life(node: Node, topic: str) -> None:
-    """Let watchers of this machine tell the death of this process from its silence.
-
-    Args:
-        node: Publishes the topic.
-        topic: Offered by `LEASE`.
-    """
-    for info in node.get_publishers_info_by_topic(topic):
-        own = (info.node_name, info.node_namespace) == (node.get_name(), node.get_namespace())
-        if own and _participant(info) not in _LIFELINES:
-            with suppress(OSError):  # without it, silence counts as death
-                _ParticipantLifeline(_participant(info), node.context)
+def full_name(info: TopicEndpointInfo) -> str:
+    """Return the fully qualified name of the node of an endpoint."""
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 
 def _participant(info: TopicEndpointInfo) -> str:
@@ -133,115 +102,79 @@ def _participant(info: TopicEndpointInfo) -> str:
 
 
 class Watch:
-    """Notices when the publisher of a topic dies, which discovery says up to 20 s later.
-
-    A process of this machine that ends counts as dead at once. One without a sign of life does, too, unless its process
-    is of this machine and lives: then after `_SILENT_S` more of silence.
+    """Notices when a server dies, which discovery says seconds later.
 
     Args:
-        node: Owner.
-        kind: Type of the topic.
-        topic: Offered by `LEASE`.
-        what: Names its publisher where its node is not known.
+        node: That asks.
+        topic: On which the server publishes; empty: any.
+        what: Names the server where its node is not known.
+        server: Full name of its node; empty: any that publishes on the topic.
     """
 
-    def __init__(self, node: Node, kind: Any, topic: str, what: str) -> None:
-        self._node, self._topic, self._what = node, topic, what
-        #: Publishers that live, and deaths so far.
-        self.alive = self.deaths = 0
+    def __init__(self, node: Node, topic: str, what: str, server: str = "") -> None:
+        self._node, self._topic, self._what, self._server = node, topic or _OF_ALL_NODES, what, server
+        #: Participants of servers that were seen; None: of another machine.
+        self._seen = dict[str, Watched | None]()
+        #: Those that discovery knows, and the name of the last one.
+        self._present = set[str]()
         self._who = ""
-        self._participants = set[str]()
-        self._buried = set[str]()
-        #: What ends the watch of a participant's lifeline.
-        self._watched = dict[str, Callable[[], None]]()
-        #: Deaths that lifelines have said, and liveliness has not.
-        self._foretold = 0
-        #: Since when there has been no sign of life of a process that lives, monotonic; infinite: there is.
-        self._silent_since = math.inf
-        events = SubscriptionEventCallbacks(liveliness=self._on_liveliness, use_default_callbacks=False)
-        self._subscription = node.create_subscription(
-            kind, topic, lambda _: None, LEASE.watch(latest()), event_callbacks=events
-        )
+        self._looking = threading.Lock()
 
     def destroy(self) -> None:
         """End it."""
-        for end in self._watched.values():
-            end()
-        self._node.destroy_subscription(self._subscription)
+        for watched in self._seen.values():
+            if watched is not None:
+                watched.close()
 
     def begin(self) -> Callable[[], str]:
         """Return a function that says who has died since this call: the node's name; "" while it lives."""
-        self._look()
-        known = self._participants - self._buried
-        if len(known) >= self.alive:
-            self._foretold = 0
-        for participant in known:
-            self._watch(participant)
-        before = self.deaths
+        served = self._alive()
+        dead = False
 
         def died() -> str:
-            if not self._who:  # who has just appeared may not have said its name yet
-                self._look()
-            self._judge_silence()
-            return (self._who or self._what) if self.deaths != before else ""
+            nonlocal served, dead
+            alive = self._alive()
+            served = served or alive  # it may not have been discovered yet
+            dead = dead or not served <= alive
+            return (self._who or self._what) if dead else ""
 
         return died
 
     @property
     def silence(self) -> float:
-        """For how long a process of this machine that lives has shown no sign of life, s; 0 while it does."""
-        return max(0.0, time.monotonic() - self._silent_since)
+        """For how long a process of this machine that lives has shown no sign of life, s."""
+        with self._looking:
+            self._look()
+            return max((watched.silence for _, watched in self._lives()), default=0.0)
 
     @property
     def dead(self) -> bool:
-        """Whether there was a publisher, and there is none that lives."""
-        self._judge_silence()
-        return self.alive <= self._foretold and bool(self.deaths)
+        """Whether there was a server, and there is none that lives."""
+        return not self._alive() and bool(self._seen)
 
-    def _judge_silence(self) -> None:
-        """Count one that has been silent for too long as dead."""
-        if time.monotonic() - self._silent_since > _SILENT_S:
-            self._silent_since = math.inf
-            self._buried |= self._participants
-            self.deaths += 1
+    def _alive(self) -> set[str]:
+        """Return the servers that live, and do not hang."""
+        with self._looking:
+            self._look()
+            there = {name for name, watched in self._seen.items() if watched is None} & self._present
+            return there | {name for name, watched in self._lives() if watched.silence < _SILENT_S}
 
-    def _on_liveliness(self, event: QoSLivelinessChangedInfo) -> None:
-        self._look()
-        lost, self.alive = self.alive - event.alive_count, event.alive_count
-        if lost <= 0:
-            self._silent_since = math.inf
-            return
-        foretold = min(lost, self._foretold)
-        self._foretold -= foretold
-        if lost == foretold:
-            return
-        known = self._participants - self._buried
-        dead = {participant for participant in known if not lives(participant)}
-        if known and not dead:
-            self._silent_since = time.monotonic()
-            for participant in known:
-                self._watch(participant)
-        else:
-            self._buried |= dead
-            self.deaths += 1
-
-    def _watch(self, participant: str) -> None:
-        if participant not in self._watched and (end := watch(participant, partial(self._bury, participant))):
-            self._watched[participant] = end
-
-    def _bury(self, participant: str) -> None:
-        """Count the end of a process; in a thread of its own."""
-        if participant not in self._buried:
-            self._buried.add(participant)
-            self._foretold += 1
-            self.deaths += 1
+    def _lives(self) -> list[tuple[str, Watched]]:
+        """Return the processes of this machine that live."""
+        return [(name, watched) for name, watched in self._seen.items() if watched is not None and not watched.ended]
 
     def _look(self) -> None:
         """Keep the name of the node: the graph may have lost it when it is asked for."""
+        self._present.clear()
         for info in self._node.get_publishers_info_by_topic(self._topic):
-            if not info.node_name.startswith("_"):
+            if self._server not in ("", full_name(info)):
+                continue
+            if not info.node_name.startswith("_"):  # one that has just appeared may not have said its name yet
                 self._who = f"the node {info.node_name}"
-            self._participants.add(_participant(info))
+            participant = _participant(info)
+            self._present.add(participant)
+            if self._seen.get(participant) is None:
+                self._seen[participant] = watch(participant)
 
 
 class ActionServer(action.ActionServer):
@@ -252,9 +185,8 @@ class ActionServer(action.ActionServer):
     """
 
     def __init__(self, node: Node, kind: Any, name: str, execute: Callable[..., Any], **kwargs: Any) -> None:
-        status = LEASE.offer(latest())
-        super().__init__(node, kind, name, execute, status_pub_qos_profile=status, **kwargs)
-        show_life(node, f"{node.resolve_topic_name(name)}/_action/status")
+        super().__init__(node, kind, name, execute, **kwargs)
+        show_life(node)
 
     async def _execute_goal_request(self, request_header_and_message: Any) -> None:
         header, request = request_header_and_message
@@ -301,7 +233,7 @@ class ActionClient(action.ActionClient):
         super().__init__(node, kind, name)
         self.name = name
         topic = f"{node.resolve_topic_name(name)}/_action/status"
-        self._watch = Watch(node, GoalStatusArray, topic, f"the server of {name}")
+        self._watch = Watch(node, topic, f"the server of {name}")
 
     def destroy(self) -> None:
         """Take the client down."""

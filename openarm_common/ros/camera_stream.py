@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image
 
@@ -15,11 +14,14 @@ from openarm_common.camera.stream import Frame, FrameStream
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.posture import JointNeed
 from openarm_common.ros.convert import stamp_to_ns
-from openarm_common.ros.node import QOS_NEWEST
+from openarm_common.ros.node import QOS_NEWEST, BaseNode, best_effort
+from openarm_common.ros.polled import Polled, Source
 from openarm_common.ros.tf import RobotStateListener
 
 #: Message types of the streams of a camera.
 _KINDS: Mapping[str, type] = {"color": Image, "depth": Image, "info": CameraInfo}
+#: Of streams that wait: of the newest stamp, some may still be on their way.
+_WAITING = best_effort(2)
 
 
 def camera_topics(camera: str, **topics: str) -> dict[str, tuple[type, str]]:
@@ -44,13 +46,14 @@ class CameraStream:
         joints: Whether the joints are needed; if so, joint states are subscribed to with the streams.
         capacity: As for `FrameStream`, and so is `max_rate`.
         max_rate: Hz.
-        on_frame: Takes each frame as soon as its posture is known; without it, call `take`.
+        on_frame: Takes each frame as soon as its posture is known; without it, messages wait in the middleware, the
+            newest two of each stream, until `take`.
         on_refusal: Takes what was refused.
     """
 
     def __init__(
         self,
-        node: Node,
+        node: BaseNode[Any],
         states: RobotStateListener | None,
         topics: Mapping[str, tuple[type, str]],
         frame_id: str = "",
@@ -68,10 +71,13 @@ class CameraStream:
         self._joints = joints != "none"
         self._on_frame, self.on_refusal = on_frame, on_refusal
         self._inputs: list[Subscription] = []
+        self._waiting: dict[str, Polled] = {}
         tracker = states.tracker if states is not None else None
         self.frames: FrameStream[Any] = FrameStream(
             tuple(topics), tracker, frame_id, pose_of=pose_of, joints=joints, capacity=capacity, max_rate=max_rate
         )
+        if max_rate:
+            node.take_images_at(max_rate, [topic for _, topic in self._topics.values()])
         if states is not None and on_frame is not None:
             states.watch(self.poll)
 
@@ -86,19 +92,29 @@ class CameraStream:
             return
         if self._states is not None and self._joints:
             self._states.enable(on, self)
-        if on:
+        if not on:
+            for subscription in self._inputs:
+                self._node.destroy_subscription(subscription)
+            self._inputs.clear()
+            self._waiting.clear()
+            self.frames.clear()
+        elif self._on_frame is None:
+            sources = {stream: Source(kind, topic, _WAITING) for stream, (kind, topic) in self._topics.items()}
+            self._waiting = {stream: Polled(self._node, source) for stream, source in sources.items()}
+            self._inputs = [waiting.subscription for waiting in self._waiting.values()]
+        else:
             self._inputs = [
                 self._node.create_subscription(kind, topic, self._adder(stream), QOS_NEWEST)
                 for stream, (kind, topic) in self._topics.items()
             ]
-            return
-        for subscription in self._inputs:
-            self._node.destroy_subscription(subscription)
-        self._inputs.clear()
-        self.frames.clear()
 
     def take(self) -> Frame[Any] | None:
         """Take the newest frame whose posture is known; refusals go to `on_refusal`."""
+        if self._states is not None:
+            self._states.poll()
+        for stream, waiting in self._waiting.items():
+            for message, received_at in waiting.take_timed():
+                self._add(stream, message, received_at)
         try:
             return self.frames.take(time.monotonic())
         except OpenArmError as error:
@@ -112,12 +128,17 @@ class CameraStream:
 
     def _adder(self, stream: str) -> Callable[[Any], None]:
         def add(message: Any) -> None:
-            head = message.header
-            try:
-                self.frames.add(stream, stamp_to_ns(head.stamp), head.frame_id, message, time.monotonic())
-            except OpenArmError as error:
-                self.on_refusal(error)
-            else:
+            if self._add(stream, message, time.monotonic()):
                 self.poll()
 
         return add
+
+    def _add(self, stream: str, message: Any, received_at: float) -> bool:
+        """Add a message; return False when it was refused."""
+        head = message.header
+        try:
+            self.frames.add(stream, stamp_to_ns(head.stamp), head.frame_id, message, received_at)
+        except OpenArmError as error:
+            self.on_refusal(error)
+            return False
+        return True

@@ -19,11 +19,10 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
-from std_msgs.msg import Empty
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.fields import check_message
-from openarm_common.ros.actions import ActionClient, Watch, alive_topic, check_alive
+from openarm_common.ros.actions import ActionClient, Watch, check_alive
 from openarm_common.ros.executor import WaitSetExecutor
 
 #: Period of checks that the server is still there, s.
@@ -265,11 +264,10 @@ class BackgroundNode(ContextNode):
         return died
 
     def _watch_node(self, name: str) -> Watch:
-        topic = alive_topic(name)
         with self._making:
-            if topic not in self._watches:
-                self._watches[topic] = Watch(self._node, Empty, topic, f"the node {name.rpartition('/')[2]}")
-            return self._watches[topic]
+            if name not in self._watches:
+                self._watches[name] = Watch(self._node, "", f"the node {name.rpartition('/')[2]}", name)
+            return self._watches[name]
 
     def _client(self, name: str, make: Callable[[], Any]) -> Any:
         with self._making:

@@ -9,7 +9,7 @@ import socket
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future as ThreadFuture
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -19,6 +19,7 @@ from typing import Any, Generic, ParamSpec, TypeVar, get_args
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from openarm_interfaces.msg import ImageRates
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -26,26 +27,29 @@ from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
-from std_msgs.msg import Empty
 
 from openarm_common.config import AT_RUN_TIME, Config, validate
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.actions import LEASE, RCLError, alive_topic, latest, show_life
+from openarm_common.ros.actions import RCLError, show_life
 from openarm_common.ros.executor import WaitSetExecutor
 from openarm_common.ros.log import PrintableLogger
 
+#: By the parameter `executor` of a node.
+EXECUTORS: dict[str, type[Executor]] = {"wait_set": WaitSetExecutor, "rclpy": SingleThreadedExecutor}
 ConfigT = TypeVar("ConfigT", bound=Config)
 P = ParamSpec("P")
 R = TypeVar("R")
 
+#: Topic of `openarm_interfaces/ImageRates`.
+IMAGE_RATES = "/image_rates"
 #: Time that a node has to stop motion before the process ends, s.
 _HOLD = 2.0
 _ENDING = (signal.SIGINT, signal.SIGTERM)
@@ -63,6 +67,11 @@ def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoS
 def reliable(depth: int) -> QoSProfile:
     """Return the profile reliable, volatile, keep last `depth`."""
     return _profile(depth)
+
+
+def best_effort(depth: int) -> QoSProfile:
+    """Return the profile best effort, volatile, keep last `depth`."""
+    return _profile(depth, reliable=False)
 
 
 #: Camera images, info, clouds as published (REP-2003).
@@ -124,18 +133,27 @@ class BaseNode(Node, Generic[ConfigT]):
         self.__refused = Counter[str]()
         self.__logger: PrintableLogger | None = None
         super().__init__(name, **kwargs)
+        self.declare_parameter(
+            "executor",
+            "wait_set",
+            ParameterDescriptor(
+                description="wait_set: entities are kept from one wait to the next; rclpy: SingleThreadedExecutor",
+                additional_constraints=f"one of {', '.join(EXECUTORS)}",
+                read_only=True,
+            ),
+        )
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         data = _declare(self, model, "", {})
         self.config: ConfigT = validate(model, data, f"parameters of {self.get_fully_qualified_name()}")
         self.__pool = ThreadPoolExecutor(max_workers=4, thread_name_prefix=name)
         self.__description: RobotDescription | None = None
+        self.__rates: dict[str, float] = {}
+        self.__rates_out: Any = None
         self.__status = DiagnosticStatus(
             level=DiagnosticStatus.STALE, name=f"{self.get_name()}: status", hardware_id="openarm"
         )
         self.__diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
-        # While it is there, clients of services know that they will be answered.
-        self.__alive = self.create_publisher(Empty, alive_topic(self.get_fully_qualified_name()), LEASE.offer(latest()))
-        show_life(self, alive_topic(self.get_fully_qualified_name()))
+        show_life(self)
         self.create_timer(self.REPORT_PERIOD_S, self.__publish_diagnostics, clock=self.steady_clock)
 
     @property
@@ -193,6 +211,14 @@ class BaseNode(Node, Generic[ConfigT]):
 
         guarded: Any = take_async if iscoroutinefunction(callback) else take
         return super().create_subscription(msg_type, topic, guarded, *args, **kwargs)
+
+    def take_images_at(self, rate: float, topics: Iterable[str]) -> None:
+        """Tell who makes images how many of topics this node takes, Hz; 0: what is made for others is enough."""
+        self.__rates |= dict.fromkeys(map(self.resolve_topic_name, topics), rate)
+        if self.__rates_out is None:
+            self.__rates_out = self.create_publisher(ImageRates, IMAGE_RATES, QOS_LATCHED)
+        said = ImageRates(node=self.get_fully_qualified_name(), topics=[*self.__rates], rates=[*self.__rates.values()])
+        self.__rates_out.publish(said)
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any) -> Any:
         """Offer a service; those that set parameters refuse a value of an unknown type, which would end rclpy."""
@@ -255,6 +281,18 @@ class BaseNode(Node, Generic[ConfigT]):
     def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Any:
         """Run `fn` in a worker thread; await the returned future in a coroutine callback."""
         return self.awaitable(self.__pool.submit(fn, *args, **kwargs))
+
+    def make_executor(self) -> Executor:
+        """Return the executor that the parameter `executor` names.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when it names none.
+        """
+        name = self.get_parameter("executor").value
+        if name not in EXECUTORS:
+            text = f"executor of {self.get_fully_qualified_name()} is {brief(str(name))}"
+            raise OpenArmError(Code.CONFIG_INVALID, f"{text}; expected one of {', '.join(EXECUTORS)}")
+        return EXECUTORS[name]()
 
     async def hold(self) -> None:
         """Stop all motion that the node commands; called before the process ends, while the graph is still there."""
@@ -337,6 +375,16 @@ def _constraints(field: FieldInfo) -> str:
 _SYMBOLS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
+def prepare() -> None:
+    """Load what all nodes need: of a process that forks nodes, before it does."""
+    RobotDescription.load()
+    messages = [module for name, module in list(sys.modules.items()) if name.endswith((".msg", ".srv", ".action"))]
+    kinds: list[Any] = [type(one) for module in messages for one in vars(module).values() if isinstance(one, type)]
+    for kind in kinds:
+        if hasattr(kind, "__import_type_support__"):
+            kind.__import_type_support__()
+
+
 def run(factory: Callable[[], BaseNode[Any]]) -> None:
     """Run a node: create, spin until SIGINT or SIGTERM, shut down in order, exit.
 
@@ -351,7 +399,7 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
         node = factory()
         if not rclpy.ok():  # the signal came while the node was being made
             raise ExternalShutdownException
-        executor = WaitSetExecutor()
+        executor = node.make_executor()
         for one in (node, *node.companions):
             executor.add_node(one)
         signals.node = node

@@ -55,7 +55,7 @@ class Polled:
     def __init__(self, node: Node, source: Source) -> None:
         self._node, self._source = node, source
         # The callback is never called.
-        self._subscription: Any = node.create_subscription(
+        self.subscription: Any = node.create_subscription(
             source.kind, source.topic, lambda _: None, source.qos, callback_group=Unspun()
         )
         self._received_at = time.monotonic()
@@ -67,7 +67,7 @@ class Polled:
     def take_timed(self) -> list[tuple[Any, float]]:
         """All messages that wait, and when each arrived, s of the monotonic clock."""
         taken: list[tuple[Any, float]] = []
-        handle, kind = self._subscription.handle, self._subscription.msg_type
+        handle, kind = self.subscription.handle, self.subscription.msg_type
         with handle:
             while (one := handle.take_message(kind, False)) is not None:
                 taken.append((one[0], one[1]["received_timestamp"] * 1e-9))
@@ -90,4 +90,4 @@ class Polled:
 
     def close(self) -> None:
         """Unsubscribe."""
-        self._node.destroy_subscription(self._subscription)
+        self._node.destroy_subscription(self.subscription)

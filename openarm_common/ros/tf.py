@@ -7,13 +7,13 @@ the same.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TransformStamped
-from rclpy.node import Node
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
@@ -23,11 +23,14 @@ from openarm_common.camera.housings import mounted
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.posture import PostureTracker
+from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import held_from_msg, joints_from_msg, stamp_to_ns, transform_to_matrix
-from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF, reliable
+from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF, BaseNode, reliable
+from openarm_common.ros.polled import Polled, Source
 
 #: Its origin is on the table top below the base; where the table is, for every node.
 TABLE_FRAME = "table"
+_TOPIC = "/joint_states"
 
 
 def table_height(message: TFMessage) -> float | None:
@@ -38,20 +41,22 @@ def table_height(message: TFMessage) -> float | None:
 class RobotStateListener:
     """Keeps a `PostureTracker` filled.
 
+    Joint states wait in the middleware until they are asked for: a node that woke for each would spend more time on
+    waking than on its work. Who is to be told of each at once calls `watch`.
+
     Args:
         node: The node that subscribes.
         description: The robot.
-        joints: Whether to subscribe to /joint_states from the start; at 100 Hz that costs 5 to 10 % of a core, so a
-            node that needs it only now and then passes False and calls `enable`.
-        depth: Joint states that wait while the node is busy: few for a node that acts on the newest; those of the time
-            that an image takes for one that asks for the stamp of an image.
+        joints: Whether to subscribe to /joint_states from the start; else `enable` does.
+        depth: Joint states that wait: few for a node that acts on the newest; those of the time that an image takes for
+            one that asks for the stamp of an image.
         wait: Longest wait for what a posture needs, s.
         held_topic: What the hands hold, as markers on links; empty: not subscribed to.
     """
 
     def __init__(
         self,
-        node: Node,
+        node: BaseNode[Any],
         description: RobotDescription,
         *,
         joints: bool = True,
@@ -60,8 +65,7 @@ class RobotStateListener:
         held_topic: str = "",
     ) -> None:
         self.tracker = PostureTracker(description, wait)
-        self.buffer = self.tracker.buffer
-        self.efforts: dict[str, float] = {}
+        self._efforts: dict[str, float] = {}
         self._node = node
         self._depth = depth
         self._users: set[object] = set()
@@ -69,7 +73,9 @@ class RobotStateListener:
         self._on_table: Callable[[float], None] | None = None
         self._on_mounts: Callable[[dict[str, CameraConfig]], None] | None = None
         self._cameras: dict[str, CameraConfig] = {}
-        self._joints: Subscription | None = None
+        self._joints: Any = None
+        self._waiting: Polled | None = None
+        self._polling = threading.Lock()
         node.create_subscription(TFMessage, "/tf_static", self._on_static, QOS_STATIC_TF)
         if held_topic:
             node.create_subscription(MarkerArray, held_topic, self._on_held, QOS_LATCHED)
@@ -80,15 +86,33 @@ class RobotStateListener:
         (self._users.add if on else self._users.discard)(user)
         self.tracker.listen(bool(self._users), time.monotonic())
         if self._users and self._joints is None:
-            self._joints = self._node.create_subscription(
-                JointState, "/joint_states", self._on_joints, reliable(self._depth)
-            )
+            qos = reliable(self._depth)
+            if self._watchers:
+                self._joints = self._node.create_subscription(JointState, _TOPIC, self._on_joints, qos)
+            else:
+                self._waiting = Polled(self._node, Source(JointState, _TOPIC, qos))
+                self._joints = self._waiting.subscription
         elif not self._users and self._joints is not None:
             self._node.destroy_subscription(self._joints)
-            self._joints = None
+            self._joints = self._waiting = None
+
+    @property
+    def buffer(self) -> RobotStateBuffer:
+        """Joint states and frames."""
+        self.poll()
+        return self.tracker.buffer
+
+    def poll(self) -> None:
+        """Take the joint states that wait."""
+        with self._polling:
+            for message, received_at in self._waiting.take_timed() if self._waiting is not None else ():
+                try:
+                    self._take(message, received_at)
+                except OpenArmError as error:
+                    self._node.refuse(_TOPIC, error)
 
     def watch(self, on_news: Callable[[], None]) -> None:
-        """Call a function after each joint state and each transform."""
+        """Call a function after each joint state, from the next time that any is wanted, and after each transform."""
         self._watchers.append(on_news)
 
     def follow_table(self, on_height: Callable[[float], None]) -> None:
@@ -104,14 +128,24 @@ class RobotStateListener:
 
     def age_s(self) -> float:
         """Return the seconds of wall clock since the newest joint state arrived; infinite before the first."""
+        self.poll()
         return self.tracker.age_s(time.monotonic())
 
+    @property
+    def efforts(self) -> dict[str, float]:
+        """Newest efforts by joint name, N·m or N; without those that are not measured."""
+        self.poll()
+        return self._efforts
+
     def _on_joints(self, message: JointState) -> None:
+        self._take(message, time.monotonic())
+        self._notify()
+
+    def _take(self, message: JointState, received_at: float) -> None:
         joints_from_msg(message)
         t_ns = stamp_to_ns(message.header.stamp)
-        self.tracker.add(t_ns, message.name, message.position, time.monotonic(), message.velocity)
-        self.efforts = dict(zip(message.name, message.effort, strict=False))
-        self._notify()
+        self.tracker.add(t_ns, message.name, message.position, received_at, message.velocity)
+        self._efforts = dict(zip(message.name, message.effort, strict=False))
 
     def _on_static(self, message: TFMessage) -> None:
         refused: OpenArmError | None = None

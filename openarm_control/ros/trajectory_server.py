@@ -4,8 +4,9 @@
 An invalid trajectory (unknown joints, NaN, out of limits, …) is accepted as a goal and aborted at once, because only a
 result can carry the reason to the client: `error_code` INVALID_GOAL or INVALID_JOINTS and `error_string`.
 
-A client that publishes the id of its goal on `owner`, with the liveliness of `openarm_common.ros.actions`, has the arm
-hold when it dies; for other clients goals run to their end, as with ros2_control.
+A client that publishes the id of its goal on `owner` has the arm hold when it dies: at once where it is of this machine
+and has a lifeline of that name, else when discovery has forgotten it. For other clients goals run to their end, as with
+ros2_control.
 """
 
 from __future__ import annotations
@@ -18,12 +19,11 @@ from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action.server import ServerGoalHandle
 from rclpy.duration import Duration as RclDuration
-from rclpy.event_handler import QoSLivelinessChangedInfo, SubscriptionEventCallbacks
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from openarm_common import lifeline
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.actions import LEASE, latest, owner_topic
+from openarm_common.ros.actions import latest, owner_topic
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_common.types import Array
@@ -75,26 +75,21 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         self._states = node.create_publisher(JointTrajectoryControllerState, f"{controller}/controller_state", 10)
         on_trajectory: Any = self._on_trajectory  # rclpy awaits coroutines; its type hints do not allow them
         node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", on_trajectory, QOS_COMMAND)
-        self._owned = b""
-        self._owners = 0
-        node.create_subscription(
-            GoalInfo,
-            owner_topic(f"{controller}/follow_joint_trajectory"),
-            self._on_owner,
-            LEASE.watch(latest()),
-            event_callbacks=SubscriptionEventCallbacks(liveliness=self._on_owners, use_default_callbacks=False),
-        )
+        self._owner_topic = owner_topic(f"{controller}/follow_joint_trajectory")
+        #: The goal of an owner of another machine, and how many publish there.
+        self._owned, self._owners = b"", 0
+        node.create_subscription(GoalInfo, self._owner_topic, self._on_owner, latest())
 
     def _on_owner(self, info: GoalInfo) -> None:
-        """Take note of a goal that may run only while its owner lives: one of this machine is seen to end at once."""
-        goal = self._owned = bytes(info.goal_id.uuid)
-        lifeline.watch(goal.hex(), lambda: self._lose(goal, "the client of the goal has ended"))
+        """Take note of a goal that may run only while its owner lives."""
+        goal = bytes(info.goal_id.uuid)
+        local = lifeline.watch(goal.hex(), lambda: self._lose(goal, "the client of the goal has ended"))
+        self._owned, self._owners = b"" if local else goal, self._node.count_publishers(self._owner_topic)
 
-    def _on_owners(self, event: QoSLivelinessChangedInfo) -> None:
-        """Hold when an owner of another machine is gone, or one is stopped."""
-        gone, self._owners = event.alive_count < self._owners, event.alive_count
-        if gone:
-            self._lose(self._owned, f"no sign of life of the goal's client for {LEASE.accepted:g} s")
+    def _check_owner(self) -> None:
+        if self._owned and self._node.count_publishers(self._owner_topic) < self._owners:
+            self._lose(self._owned, "the client of the goal is gone")
+            self._owned = b""
 
     def _lose(self, goal: bytes, why: str) -> None:
         """Hold: nothing watches the motion any more."""
@@ -158,6 +153,7 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         self._states.publish(message)
 
     def _publish_feedback(self) -> None:
+        self._check_owner()
         state = self._arm.state
         if self._running is not None and state is not None:
             self._running.publish_feedback(_feedback(self._arm.group.names, state))

@@ -17,7 +17,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.lifeline import Lifeline
 from openarm_common.robot.lift import LIFT
 from openarm_common.robot.robot_state import RobotStateBuffer
-from openarm_common.ros.actions import LEASE, ActionClient, latest, owner_topic
+from openarm_common.ros.actions import ActionClient, latest, owner_topic
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_to_msg
 from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BaseNode
@@ -120,7 +120,7 @@ class Controller:
         self.name = name
         self._goal_id = goal_id
         self._client = ActionClient(node, FollowJointTrajectory, name)
-        self._owner = node.create_publisher(GoalInfo, owner_topic(name), LEASE.offer(latest()))
+        self._owner = node.create_publisher(GoalInfo, owner_topic(name), latest())
 
     def ready(self) -> bool:
         """Whether its action is in the graph."""

@@ -44,6 +44,9 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         topics = {"depth": config.depth_topic, "info": config.info_topic}
         cameras = [depth_camera(name) for name in config.cameras]
         self._cameras = [depth_source(self, self._states, camera, topics, need) for camera in cameras]
+        # Twice in a period: the newest is then at most half a period old.
+        taken = [topic.format(camera=name) for topic in topics.values() for name in config.cameras]
+        self.take_images_at(2.0 / config.period, taken)
         self._sources: list[Source] = [*self._cameras]
         if config.cloud_topic:
             self._sources.append(cloud_source(self, self._states, config.cloud_topic, need))

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
 from openarm_common.camera.cameras import CameraConfig
@@ -17,6 +16,7 @@ from openarm_common.errors import OpenArmError
 from openarm_common.robot.posture import JointNeed
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import depth_image, intrinsics_from_info, points_from_cloud
+from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
 from openarm_octomap.grid import CloudScan, DepthScan
 from openarm_octomap.mapper import Frame as MapFrame
@@ -104,7 +104,7 @@ class Source:
 
 
 def depth_source(
-    node: Node, states: RobotStateListener, camera: CameraConfig, topics: Mapping[str, str], joints: JointNeed
+    node: BaseNode[Any], states: RobotStateListener, camera: CameraConfig, topics: Mapping[str, str], joints: JointNeed
 ) -> Source:
     """Return the source of the depth images of a camera, in its optical frame.
 
@@ -124,7 +124,7 @@ def depth_source(
     return Source(camera.name, CameraStream(node, states, inputs, camera.optical_frame, joints=joints), to_scan)
 
 
-def cloud_source(node: Node, states: RobotStateListener, topic: str, joints: JointNeed) -> Source:
+def cloud_source(node: BaseNode[Any], states: RobotStateListener, topic: str, joints: JointNeed) -> Source:
     """Return the source of clouds in any known frame, whose origin is taken for that of the rays.
 
     Args:

@@ -7,13 +7,21 @@ world; in a process of its own it can delay physics only through the scheduler o
 
 from __future__ import annotations
 
+import contextlib
+import math
+import os
+import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Mapping
 
-from openarm_common.pacing import RateDivider
+from openarm_common import ports
+from openarm_common.camera.cameras import CameraConfig
+from openarm_common.pacing import AdaptiveShare, RateDivider
 from openarm_sim_bridge.cameras.handover import CameraReport, CameraSetup, StateSender, pair
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.world.world import Snapshot, World
@@ -21,6 +29,46 @@ from openarm_sim_bridge.world.world import Snapshot, World
 _MODULE = "openarm_sim_bridge.ros.camera_node"
 _AGAIN_S = 1.0
 _END_S = 3.0
+#: However slow the machine is, a camera is drawn so often, Hz of simulated time.
+_LEAST_HZ = 5.0
+
+
+class SpareProcess:
+    """A process that waits for its first message, forked while this one has no thread, participant or GL context yet.
+
+    It has imported what drawing needs, so that the first images come a second sooner.
+
+    Args:
+        serve: What it runs, given its end of the socket.
+    """
+
+    def __init__(self, serve: Callable[[socket.socket], None]) -> None:
+        self.ours, theirs = pair()
+        self.pid = os.fork()
+        if self.pid == 0:
+            self.ours.close()
+            code = 1
+            try:
+                serve(theirs)
+                code = 0
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                os._exit(code)  # without destructors of libraries, some of which wait for threads of the other process
+        theirs.close()
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end, s; return its exit code, as `subprocess.Popen.wait`."""
+        deadline = math.inf if timeout is None else time.monotonic() + timeout
+        while (ended := os.waitpid(self.pid, os.WNOHANG)) == (0, 0):
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired(_MODULE, timeout or 0.0)
+            time.sleep(0.01)
+        return os.waitstatus_to_exitcode(ended[1])
+
+    def kill(self) -> None:
+        """Kill it."""
+        os.kill(self.pid, signal.SIGKILL)
 
 
 class CameraFeed:
@@ -35,8 +83,12 @@ class CameraFeed:
         first: A state to warm up with.
         on_fault: Called (from `poll`) with a sentence when it died or can't draw, with "" when it draws again.
         speed: Simulated seconds per second of wall time. Above 1 the cameras keep their rates on the wall clock.
+        spare: A process that has not drawn yet, to begin with.
+
+    On a machine that is too slow for all frames, fewer are drawn; simulated time does not wait for them.
 
     Attributes:
+        rates: Frames a second of each camera that are drawn at present, Hz; 0: nobody needs one.
         rendered: Frames drawn so far, by camera.
         lost: Frames that could not be handed over.
         fault: Why there are no images.
@@ -50,20 +102,28 @@ class CameraFeed:
         first: Snapshot,
         on_fault: Callable[[str], None],
         speed: float = 1.0,
+        spare: SpareProcess | None = None,
     ) -> None:
         self._setup = setup
         self._environ = dict(environ)
         self._first = first
         self._on_fault = on_fault
-        self._ticks = {camera.name: RateDivider(camera.rate / max(1.0, speed)) for camera in setup.cameras}
-        self._lock = threading.Lock()  # of the sender, which is exchanged when the process is started again
+        self._speed = max(1.0, speed)
+        self._share = AdaptiveShare()
+        self.rates = {camera.name: 0.0 for camera in setup.cameras}
+        self._ticks = {name: RateDivider(1.0) for name in self.rates}
+        self._lock = threading.Lock()  # of the sender and the rates, which change when the process is started again
         self.rendered = self._earlier = {camera.name: 0 for camera in setup.cameras}
         self._died_at: float | None = None
+        #: UDP ports of the process, and those of the one that died before it.
+        self._ports: frozenset[int] = frozenset()
+        self._held = contextlib.ExitStack()
         self._faults: tuple[Fault, ...] = ()
         self.lost = 0
         self.fault = ""
         self.report = CameraReport()
-        self._start()
+        self._process: subprocess.Popen[bytes] | SpareProcess
+        self._start(spare)
 
     @property
     def dropped(self) -> int:
@@ -92,14 +152,11 @@ class CameraFeed:
             self._sender.faults(faults)
 
     def tick(self, world: World) -> None:
-        """Hand the tick over for the cameras that are due and watched; in the thread of the simulation, never waits."""
-        watched = self.report.watched
-        names = [name for name, ticks in self._ticks.items() if ticks.due(world.t_ns) and name in watched]
-        if names:
-            snapshot = world.snapshot()
-            with self._lock:
-                if not self._sender.offer(snapshot, names):
-                    self.lost += len(names)
+        """Hand the tick over for the cameras that are due; in the thread of the simulation, never waits."""
+        with self._lock:
+            names = [name for name, ticks in self._ticks.items() if ticks.due(world.t_ns) and self.rates[name] > 0.0]
+            if names and not self._sender.offer(world.snapshot(), names):
+                self.lost += len(names)
 
     def poll(self) -> None:
         """Take its reports and restart it when it died; for a timer of a few hertz."""
@@ -111,32 +168,56 @@ class CameraFeed:
             for report in self._sender.reports():
                 self.report = report
                 self.rendered = {name: n + report.rendered.get(name, 0) for name, n in self._earlier.items()}
+                self._pace()
+                if report.ready and not self._ports:
+                    self._ports = ports.used_by(self._process.pid, int(self._environ["ROS_DOMAIN_ID"]))
                 if report.fault != self.fault:
                     self.fault = report.fault
                     self._on_fault(report.fault)
         except EOFError:
             self._on_death()
 
+    def _pace(self) -> None:
+        """Draw as often as somebody needs, and as the machine can."""
+        share = self._share.update(sum(self.rendered.values()), self.dropped)
+        for camera in self._setup.cameras:
+            rate = min(self._wanted(camera), max(_LEAST_HZ, share * camera.rate))
+            if rate not in (0.0, self.rates[camera.name]):
+                self._ticks[camera.name] = RateDivider(rate / self._speed)
+            self.rates[camera.name] = rate
+
+    def _wanted(self, camera: CameraConfig) -> float:
+        return min(camera.rate, self.report.rates.get(camera.name, 0.0))
+
+    @property
+    def limited(self) -> str:
+        """Says which cameras the machine does not draw as often as somebody needs; empty when it does."""
+        wanted = ((camera.name, self._wanted(camera)) for camera in self._setup.cameras)
+        slow = [f"{name} at {self.rates[name]:.0f} of {hz:.0f} Hz" for name, hz in wanted if self.rates[name] < hz]
+        return f"this machine draws no faster: {', '.join(slow)}" if slow else ""
+
     def close(self) -> None:
         """End it."""
         with self._lock:
             self._sender.close()
         self._wait()
+        self._held.close()
 
-    def _start(self) -> None:
-        ours, theirs = pair()
+    def _start(self, spare: SpareProcess | None = None) -> None:
+        ours, theirs = pair() if spare is None else (spare.ours, None)
         with self._lock:
             self._sender = StateSender(ours, self._setup)
             self._sender.offer(self._first, ())
             if self._faults:
                 self._sender.faults(self._faults)
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", _MODULE, str(theirs.fileno())],
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL,
-            env=self._environ,
-        )
-        theirs.close()
+        if spare is None and theirs is not None:
+            command = [sys.executable, "-m", _MODULE, str(theirs.fileno())]
+            with theirs:
+                self._process = subprocess.Popen(
+                    command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=self._environ
+                )
+        elif spare is not None:
+            self._process = spare
         self._died_at = None
 
     def _on_death(self) -> None:
@@ -145,7 +226,10 @@ class CameraFeed:
             self._earlier = self.rendered
             self.lost += self.report.dropped
             self.report = CameraReport()
+            self.rates = dict.fromkeys(self.rates, 0.0)
         code = self._wait()
+        self._held.close()
+        self._held, self._ports = ports.held(self._ports), frozenset()
         self._died_at = time.monotonic()
         self.fault = f"the process that draws ended with code {code}; it is started again"
         self._on_fault(self.fault)

@@ -57,7 +57,7 @@ class CameraReport:
     Attributes:
         ready: A frame of every camera was drawn, it can begin.
         fault: Why it can't draw.
-        watched: Cameras with a subscriber.
+        rates: At which a camera is subscribed to, Hz: infinite: all its frames; 0: nobody needs one.
         rendered: Frames drawn so far, by camera.
         dropped: Frames that newer ones replaced before they were drawn.
         draw_ms: Mean time of the frames drawn since the last report.
@@ -65,7 +65,7 @@ class CameraReport:
 
     ready: bool = False
     fault: str = ""
-    watched: tuple[str, ...] = ()
+    rates: Mapping[str, float] = field(default_factory=dict[str, float])
     rendered: Mapping[str, int] = field(default_factory=dict[str, int])
     dropped: int = 0
     draw_ms: float = 0.0

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `mujoco_cameras`: draws the cameras in a process of its own and publishes their images.
 
-Started by the bridge, which hands over the states to draw (see `handover`); it ends with the bridge. It subscribes to
-nothing and has no executor: one thread draws and publishes.
+Started by the bridge, which hands over the states to draw (see `handover`); it ends with the bridge. It has no
+executor: one thread draws and publishes.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from openarm_sim_bridge.ros.camera_publisher import CameraPublisher
 NODE_NAME = "mujoco_cameras"
 #: Period in which subscribers are counted and the bridge gets a report, s.
 _REPORT_S = 0.2
+#: Of the process, below that of the bridge; what is busy beside it leaves it a quarter of a processor.
+_NICE = 5
 
 
 class CameraNode(Node):
@@ -104,7 +106,7 @@ class CameraNode(Node):
             CameraReport(
                 ready=self._ready,
                 fault=self._fault,
-                watched=self._images.poll(),
+                rates=self._images.poll(),
                 rendered=dict(self._rendered),
                 dropped=self._receiver.dropped,
                 draw_ms=1e3 * self._spent_s / max(self._drawn, 1),
@@ -113,13 +115,16 @@ class CameraNode(Node):
         self._spent_s, self._drawn = 0.0, 0
 
 
-def main() -> None:
-    """Run the node; the only argument is the descriptor of its end of the socket."""
+def serve(end: socket.socket) -> None:
+    """Run the node until the bridge ends.
+
+    Args:
+        end: Of the socket to the bridge.
+    """
     # Signals of the terminal are for the bridge; this process ends when the bridge lets go of the socket.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    os.nice(1)  # a late image is a late image; a late joint state is a fault
-    end = socket.socket(fileno=int(sys.argv[1]))
+    os.nice(_NICE)  # a late image is a late image; a late joint state is a fault
     node: CameraNode | None = None
     try:
         receiver = StateReceiver(end)
@@ -132,6 +137,11 @@ def main() -> None:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+
+
+def main() -> None:
+    """Run the node; the only argument is the descriptor of its end of the socket."""
+    serve(socket.socket(fileno=int(sys.argv[1])))
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from openarm_common.camera.cameras import CameraConfig, Intrinsics
 from openarm_common.ros.convert import ENCODINGS, array_to_image, image_to_array, info_from_intrinsics, ns_to_stamp
+from openarm_common.ros.image_rates import WantedRates
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_sim_bridge.cameras.cameras import SimulatedCameras
 from openarm_sim_bridge.cameras.handover import CameraSetup
@@ -52,10 +53,13 @@ class _Stream:
     def info_of(self, intrinsics: Intrinsics) -> CameraInfo:
         return info_from_intrinsics(intrinsics, self._camera.optical_frame, 0, self._camera.baseline)
 
-    def poll(self) -> bool:
+    def poll(self, wanted: WantedRates) -> float:
         self.wants_image = self.image.get_subscription_count() > 0
         self.wants_info = self.info.get_subscription_count() > 0
-        return self.wants_image or self.wants_info
+        subscribed = [
+            out.topic_name for out, to in ((self.image, self.wants_image), (self.info, self.wants_info)) if to
+        ]
+        return wanted.of(subscribed)
 
     def due(self, t_ns: int, *, image: bool) -> Iterator[tuple[Publisher, Image | CameraInfo]]:
         """Yield the messages to publish now; they are reused for the next frame."""
@@ -85,6 +89,7 @@ class CameraPublisher:
         self.cameras = SimulatedCameras(
             partial(SnapshotRenderer, configs), configs, setup.depth_noise, setup.colour_noise, rng
         )
+        self._wanted = WantedRates(node)
         self._late: list[tuple[float, Publisher, Image | CameraInfo]] = []
         encodings = {"color": "rgb8", "depth": setup.depth_encoding}
         self._streams = {
@@ -92,10 +97,10 @@ class CameraPublisher:
             for camera in setup.cameras
         }
 
-    def poll(self) -> tuple[str, ...]:
-        """Count the subscribers; return the cameras that have any."""
-        subscribed = {name: [stream.poll() for stream in streams] for name, streams in self._streams.items()}
-        return tuple(name for name, streams in subscribed.items() if any(streams))
+    def poll(self) -> dict[str, float]:
+        """Look who subscribes; return at which rate to each camera, as `CameraReport.rates`."""
+        self._wanted.poll()
+        return {name: max(stream.poll(self._wanted) for stream in streams) for name, streams in self._streams.items()}
 
     def wants_image(self, name: str) -> bool:
         """Whether an image of the camera has a subscriber, not only its CameraInfo."""

@@ -19,17 +19,17 @@ from std_msgs.msg import Float64
 
 from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.pacing import AdaptiveSpeed
 from openarm_common.resources import config_dir
 from openarm_common.ros.node import reliable, run, until_shutdown
 from openarm_common.scene.scene import load_scene
 from openarm_control.joints import JointReadout
 from openarm_control.ros.process import ControlNode, timely
-from openarm_sim_bridge.cameras.camera_feed import CameraFeed
+from openarm_sim_bridge.cameras.camera_feed import CameraFeed, SpareProcess
 from openarm_sim_bridge.cameras.handover import CameraSetup
 from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.robot import SimulatedRobot
+from openarm_sim_bridge.ros.camera_node import serve
 from openarm_sim_bridge.ros.camera_publisher import topic_names
 from openarm_sim_bridge.ros.faces import Face, MotorFace, OpenArmRos2Face, SuiteFace
 from openarm_sim_bridge.ros.fault_server import FaultServer
@@ -56,11 +56,15 @@ _LATE_MS = 15.0
 class MujocoBridge(ControlNode[BridgeConfig]):
     """The simulation with its topics, services and actions.
 
+    Args:
+        spare: A process for its cameras.
+        kwargs: Of `BaseNode`.
+
     Raises:
         OpenArmError: CONFIG_INVALID or SCENE_INVALID, when the world can't be made.
     """
 
-    def __init__(self, **kwargs: Any) -> None:
+    def __init__(self, spare: SpareProcess | None = None, **kwargs: Any) -> None:
         super().__init__("mujoco_bridge", BridgeConfig, **kwargs)
         config = self.config
         cameras = load_cameras(Path(config.cameras) if config.cameras else None)
@@ -87,7 +91,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
             clock=not self._face.wall_stamps,
             robot=self._face.speaks,
         )
-        self._images = self._camera_feed(cameras, world.snapshot()) if config.images else None
+        self._images = self._camera_feed(cameras, world.snapshot(), spare) if config.images else None
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
         self._face.serve(self._simulation)
@@ -101,9 +105,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         self.create_timer(REPORT_PERIOD_S, self._report, clock=self.steady_clock)
 
         if self._images is not None:
-            adapts = 0.0 < config.speed <= 1.0 and not self._face.wall_stamps
-            self._speed = AdaptiveSpeed(config.speed) if adapts else None
-            self.create_timer(WATCH_PERIOD_S, partial(self._watch, self._images), clock=self.steady_clock)
+            self.create_timer(WATCH_PERIOD_S, self._images.poll, clock=self.steady_clock)
             if not self._images.wait_ready(WARM_UP_S):
                 self.get_logger().warning(f"no image yet after {WARM_UP_S:.0f} s; the simulation begins without")
         self._states.publish_static(self.description)
@@ -134,7 +136,9 @@ class MujocoBridge(ControlNode[BridgeConfig]):
             if self._images is not None:
                 self._images.tick(self._simulation.world)
 
-    def _camera_feed(self, cameras: Mapping[str, CameraConfig], first: Snapshot) -> CameraFeed:
+    def _camera_feed(
+        self, cameras: Mapping[str, CameraConfig], first: Snapshot, spare: SpareProcess | None
+    ) -> CameraFeed:
         topics = [name for camera in cameras.values() for name in topic_names(camera)]
         setup = CameraSetup(
             cameras=tuple(cameras.values()),
@@ -147,13 +151,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         environ = {**os.environ, "ROS_DOMAIN_ID": str(self.context.get_domain_id())}
         if LARGE_PROFILE in environ:
             environ[PROFILE] = environ[LARGE_PROFILE]
-        return CameraFeed(setup, environ, first, self._on_no_images, self.config.speed)
-
-    def _watch(self, images: CameraFeed) -> None:
-        """Take the reports of the cameras, and slow simulated time down while they can't draw all frames."""
-        images.poll()
-        if self._speed is not None:
-            self._simulation.set_speed(self._speed.update(sum(images.rendered.values()), images.dropped))
+        return CameraFeed(setup, environ, first, self._on_no_images, self.config.speed, spare)
 
     def _on_no_images(self, fault: str) -> None:
         if fault:
@@ -180,9 +178,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         slow = not simulation.paused and config.speed > 0.0 and period.n > 100 and factor < _SLOW * config.speed
         if not fault and slow:
             fault = f"slower than requested: {factor:.2f} simulated seconds per second, expected {config.speed:g}"
-            if simulation.speed < config.speed:
-                fault += "; the machine draws no faster: lower rates or sizes of the cameras, or take a GPU"
-        late_ms = _LATE_MS / min(1.0, simulation.speed or 1.0)
+        late_ms = _LATE_MS / min(1.0, config.speed or 1.0)
         values = self._face.values()
         if not fault and not simulation.paused and period.n > 100 and period.p99_ms > late_ms:
             commands = values.get("commands_per_s", 0)
@@ -190,9 +186,10 @@ class MujocoBridge(ControlNode[BridgeConfig]):
                 f"late: one of a hundred joint states is {period.p99_ms:.0f} ms or more behind the one before, expected"
                 f" {late_ms:.0f} at most; is the machine busy, or are {commands} commands a second too many?"
             )
-        self.diagnose(
-            not fault,
-            fault or ("paused" if simulation.paused else "running"),
+        limited = images.limited if images is not None else ""
+        report = self.diagnose_warning if limited and not fault else partial(self.diagnose, not fault)
+        report(
+            fault or limited or ("paused" if simulation.paused else "running"),
             real_time_factor=f"{factor:.3f}",
             joint_state_period_p50_ms=f"{period.p50_ms:.2f}",
             joint_state_period_p99_ms=f"{period.p99_ms:.2f}",
@@ -204,8 +201,8 @@ class MujocoBridge(ControlNode[BridgeConfig]):
             faults_active=" ".join(self._faults.active),
             frames_dropped=images.dropped if images is not None else 0,
             draw_ms=f"{images.report.draw_ms:.1f}" if images is not None else "",
-            watched=" ".join(sorted(images.report.watched)) if images is not None else "",
             **{f"frames_{name}": count - before[name] for name, count in drawn.items()},
+            **{f"rate_{name}": f"{rate:.0f}" for name, rate in (images.rates if images is not None else {}).items()},
         )
 
 
@@ -214,19 +211,23 @@ def _priority(node: MujocoBridge) -> int:
     return node.config.thread_priority if 0.0 < node.config.speed <= 1.0 else 0
 
 
-def make() -> MujocoBridge:
+def make(spare: SpareProcess | None = None) -> MujocoBridge:
     """Make the node for a process of its own."""
     if PROFILE in os.environ:
         os.environ[LARGE_PROFILE] = os.environ[PROFILE]
         os.environ[PROFILE] = str(config_dir() / "fastdds_small.xml")
-    node = timely(MujocoBridge, _priority)
+    node = timely(partial(MujocoBridge, spare), _priority)
     mujoco.set_mju_user_warning(lambda text: node.get_logger().warning(f"MuJoCo: {text}"))  # not into a file
     return node
 
 
 def main() -> None:
     """Run the node."""
-    run(make)
+    spare = SpareProcess(serve)
+    try:
+        run(partial(make, spare))
+    finally:
+        spare.ours.close()  # where there were no cameras, it ends now
 
 
 if __name__ == "__main__":

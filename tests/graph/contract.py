@@ -26,7 +26,7 @@ QOS = {
 #: spectator camera.
 IMPLICIT = re.compile(
     r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|/joint_trajectory$|^/cloud_in$"
-    r"|^/spectator/color/camera_info$|/_alive$"
+    r"|^/spectator/color/camera_info$"
     # what clients of MoveIt publish
     r"|/servo_node/delta_(twist|joint)_cmds$"
     r"|^/collision_object$|^/attached_collision_object$|^/planning_scene$|^/trajectory_execution_event$"

@@ -115,9 +115,9 @@ def test_motion_killed_while_an_arm_moves_is_named_the_arm_holds_and_the_next_pi
     after = control.from_on(at_ns, 1.0)
     assert result.code == Code.ROBOT_LOST, f"{result.code}: {result.message}"
     assert "move to the pre-grasp: the node motion is gone" in result.message
-    assert seconds < 4.0, "2 s on a machine that is not busy"
+    assert seconds < 2.0
     held_ns = last_move_ns(after)
-    assert held_ns - at_ns < 300_000_000, "0.2 s on a machine that is not busy"
+    assert held_ns - at_ns <= 200_000_000
     settled = [m for m in after if m.t_ns > held_ns + SETTLED * 1e9]
     assert max(float(np.abs(m.position - m.reference).max()) for m in settled) < RINGING
     up.wait_back("motion", motion)
@@ -140,7 +140,7 @@ def test_grasp_killed_in_lift_is_named_and_its_successor_opens_no_hand_that_hold
     os.kill(grasp, signal.SIGKILL)
     with pytest.raises(OpenArmError, match="the node grasp is gone") as lost:
         request.result(timeout=20.0)
-    assert time.monotonic() - killed < 4.0, "2 s on a machine that is not busy"
+    assert time.monotonic() - killed < 2.0
     assert lost.value.code is Code.NOT_READY
     up.wait_back("grasp", grasp)
     refused = client.pick("green", arm="right")

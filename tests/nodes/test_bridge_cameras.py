@@ -25,6 +25,7 @@ from tf2_msgs.msg import TFMessage
 from openarm_calibration.ros.publisher import PublisherNode
 from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
+from openarm_common.config import Config
 from openarm_common.ros.convert import (
     image_to_array,
     intrinsics_from_info,
@@ -32,7 +33,7 @@ from openarm_common.ros.convert import (
     stamp_to_ns,
     transform_to_matrix,
 )
-from openarm_common.ros.node import QOS_COMMAND, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
+from openarm_common.ros.node import QOS_COMMAND, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, BaseNode, reliable
 from openarm_sim_bridge.cameras import camera_feed
 
 
@@ -254,6 +255,35 @@ def test_diagnostics_report_how_well_it_keeps_up(seeing) -> None:
         "frames_wrist",
     }
     seeing.ros.spin_until(lambda: expected <= set(values()), what=f"a status with {', '.join(sorted(expected))}")
+
+
+def test_a_camera_is_drawn_as_often_as_somebody_needs(seeing) -> None:
+    got = seeing.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    eye, topic, images = seeing.ros.add(BaseNode("eye", Config)), "/overhead/depth/image_raw", []
+
+    def until(rate: str) -> None:
+        def reached() -> bool:
+            bridge = [s for m in got[-3:] for s in m.status if s.name == "mujoco_bridge: status"]
+            values = {v.key: v.value for s in bridge for v in s.values}
+            slow = rate == "30" and any("this machine draws no faster: overhead at" in s.message for s in bridge)
+            return values.get("rate_overhead") == rate or slow
+
+        seeing.ros.spin_until(reached, what=f"{rate} images a second")
+
+    until("0")
+    eye.take_images_at(4.0, [topic])
+    subscription = eye.create_subscription(Image, topic, images.append, QOS_SENSOR)
+    until("4")
+    images.clear()
+    seeing.ros.spin_until(lambda: len(images) > 3, what="images")
+    assert np.all(np.diff(stamps(images)) >= 240_000_000)
+    eye.take_images_at(0.0, [topic])  # as a recorder of what is made for others
+    until("0")
+    other = seeing.ros.node.create_subscription(Image, topic, lambda _: None, QOS_SENSOR)  # which says nothing of it
+    until("30")
+    seeing.ros.node.destroy_subscription(other)
+    until("0")
+    eye.destroy_subscription(subscription)
 
 
 def test_a_camera_drops_its_images(seeing) -> None:

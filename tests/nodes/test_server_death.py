@@ -151,14 +151,12 @@ def test_a_server_that_halts_for_a_while_is_not_dead_and_one_that_is_killed_then
         server = children.start(SERVER)
         work = begun(pool, client)
         watched = client._clients[NAME]._watch
-        ros.spin_until(lambda: watched.alive == 1, what="a sign of life")
         server.send_signal(signal.SIGSTOP)
-        ros.spin_until(lambda: watched.alive == 0, what="silence")
-        assert watched.silence > 0.0
+        ros.spin_until(lambda: watched.silence > 2.0, what="silence")
         assert not work.done()
         server.send_signal(signal.SIGCONT)
-        ros.spin_until(lambda: watched.alive == 1, what="a sign of life again")
-        assert watched.silence == 0.0
+        ros.spin_until(lambda: watched.silence < 1.0, what="a sign of life again")
+        assert not work.done()
         server.kill()
         with pytest.raises(OpenArmError, match=r"/wait: the .* is gone"):
             work.result(60.0)
@@ -179,26 +177,17 @@ def test_a_client_notices_the_death_of_its_server_within_two_seconds(children) -
 
 
 @pytest.mark.long
-def test_the_probe_of_a_supervisor_knows_who_is_silent_and_when_it_is_deaf_itself(ros, children, patient) -> None:
+def test_the_probe_of_a_supervisor_knows_who_is_silent(ros, children) -> None:
     environ = {name: os.environ[name] for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")}
     with ReadinessClient(environ) as probe:
-        one, two = (children.start(SERVICE.replace("waiter", name)) for name in ("one", "two"))
-
-        def silent() -> list[bool]:
-            return [probe.silence(name) > 0.0 for name in ("one", "two")]
-
-        def alive() -> list[int]:
-            silent()
-            return [probe._watches[name].alive for name in ("one", "two")]
-
-        ros.spin_until(lambda: alive() == [1, 1], what="two nodes that live")
+        one, _ = (children.start(SERVICE.replace("waiter", name)) for name in ("one", "two"))
+        ros.spin_until(lambda: {"one", "two"} <= set(probe._node.get_node_names()), what="two nodes")
         one.send_signal(signal.SIGSTOP)
-        ros.spin_until(lambda: silent() == [True, False], what="the silence of the first")
-        two.send_signal(signal.SIGSTOP)
-        ros.spin_until(lambda: alive() == [0, 0], what="the silence of both")
-        assert silent() == [False, False]
+        ros.spin_until(lambda: probe.silence("one") > 2.0 > probe.silence("two"), what="the silence of the first")
         one.send_signal(signal.SIGCONT)
-        ros.spin_until(lambda: silent() == [False, True], what="the silence of the second")
+        ros.spin_until(lambda: probe.silence("one") < 1.0, what="a sign of life again")
+        one.kill()
+        ros.spin_until(lambda: probe.silence("one") == 0.0, what="its end, which is no silence")
 
 
 @pytest.mark.requirement("R-21")
@@ -213,7 +202,7 @@ def test_a_call_of_a_service_ends_when_its_node_is_killed(ros, children, undisco
         server = children.start(SERVICE)
         work = pool.submit(client.call, Trigger, NAME, Trigger.Request(), 60.0)
         ros.spin_until(
-            lambda: any(watch.alive for watch in client._watches.values()), 120.0, "a call to a node that lives"
+            lambda: any(watch._lives() for watch in client._watches.values()), 120.0, "a call to a node that lives"
         )
         server.kill()
         with pytest.raises(OpenArmError, match="/wait: the node waiter is gone") as caught:
@@ -231,7 +220,7 @@ def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> 
     clients._timer.reset()
     client = ActionClient(node, FollowJointTrajectory, NAME)
     server = children.start(SERVER)
-    ros.spin_until(lambda: client.server_is_ready() and client._watch.alive, what="the server, known to live")
+    ros.spin_until(lambda: client.server_is_ready() and client._watch._lives(), what="the server, known to live")
     ros.spin_until(lambda: "waiter" in node.get_node_names(), what="the name of the node")
     errors: list[OpenArmError] = []
 
@@ -280,4 +269,4 @@ def test_an_arm_holds_when_the_process_is_killed_that_sent_its_trajectory(bench,
 @pytest.mark.alone
 @pytest.mark.requirement("R-21")
 def test_an_arm_holds_at_once_when_the_process_is_killed_that_sent_its_trajectory(bench, children) -> None:
-    assert holds_after(bench, children) < 0.3  # 0.2 s on a machine that is not busy
+    assert holds_after(bench, children) <= 0.2

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from openarm_bringup.supervision.log import LogFile
-from openarm_bringup.supervision.process import NodeProcess
+from openarm_bringup.supervision.process import NodeProcess, command
 
 
 def texts(path: Path) -> list[str]:
@@ -68,7 +69,7 @@ def test_a_folder_that_has_gone_is_a_fault_like_a_full_disk(tmp_path: Path) -> N
 
 def test_a_process_that_says_nothing_has_a_log(tmp_path: Path) -> None:
     async def run() -> int:
-        process = await NodeProcess.start(["true"], {}, LogFile(tmp_path / "node.log", str))
+        process = await NodeProcess.start(command(["true"], os.environ), LogFile(tmp_path / "node.log", str))
         return await process.wait()
 
     assert asyncio.run(run()) == 0

@@ -117,12 +117,15 @@ def test_only_publishers_of_large_messages_get_the_large_segment(graph: Graph, t
     profile = Path(eye["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
     assert re.search(r"<segment_size>8388608</segment_size>", profile)
     assert "<maxMessageSize>4194304</maxMessageSize>" in profile
-    assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in arm
+    assert "segment_size" not in Path(arm["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
+    assert all(
+        "<leaseDuration><sec>4</sec>" in Path(env["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text() for env in (eye, arm)
+    )
     assert eye["ROS_DOMAIN_ID"] == arm["ROS_DOMAIN_ID"] == "9"
     assert eye["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert "ROS_LOCALHOST_ONLY" not in eye
     assert arm["MODE"] == "slow"
-    assert shm_need_mib(graph) == pytest.approx(8 + 5 + 2.2 + 0.65 + 0.65)
+    assert shm_need_mib(graph) == pytest.approx(8 + 5 + 2.2 + 1.2 + 1.2)
 
 
 def test_no_message_may_be_larger_than_its_segment(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from openarm_common.pacing import AdaptiveSpeed, Pacer, PeriodMeter, RateDivider, RealTimeFactor
+from openarm_common.pacing import AdaptiveShare, Pacer, PeriodMeter, RateDivider, RealTimeFactor
 
 MS = 1_000_000
 
@@ -93,21 +93,21 @@ def test_frames_keep_their_mean_rate_though_it_does_not_divide_the_ticks(rate: f
     assert gaps.min() >= 1.0 / rate - 0.010 - 1e-9
 
 
-def test_a_simulation_slows_down_until_its_frames_are_made_and_goes_faster_again() -> None:
-    speed, made, lost = AdaptiveSpeed(1.0), 6, 0
-    assert speed.update(made, lost) == 1.0
-    assert speed.update(made, lost) == 1.0  # without a new frame there is nothing to go by
+def test_fewer_frames_are_asked_for_until_they_are_made_and_more_again() -> None:
+    share, made, lost = AdaptiveShare(), 6, 0
+    assert share.update(made, lost) == 1.0
+    assert share.update(made, lost) == 1.0  # without a new frame there is nothing to go by
 
     def settled(frames_per_update: int) -> float:
-        """Speed of a machine that makes so many of at most twelve frames."""
+        """Share that a machine settles at which makes so many of at most twelve frames."""
         nonlocal made, lost
-        value = speed.update(made, lost)
+        value = share.update(made, lost)
         for _ in range(200):
             asked = round(12 * value)
             made, lost = made + min(asked, frames_per_update), lost + max(0, asked - frames_per_update)
-            value = speed.update(made, lost)
+            value = share.update(made, lost)
         return value
 
     assert 0.4 < settled(6) < 0.65
-    assert settled(0) == pytest.approx(0.2)  # not at all is no use to anyone
+    assert settled(0) == pytest.approx(0.1)  # so that it is soon back
     assert settled(12) == 1.0

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Iterator
 
@@ -88,7 +89,7 @@ def test_a_side_that_does_not_listen_blocks_no_one(ends) -> None:
 def test_reports_come_back(ends) -> None:
     sender, receiver, _ = ends
     assert sender.reports() == []
-    report = CameraReport(ready=True, watched=("a",), rendered={"a": 3, "b": 0}, dropped=1)
+    report = CameraReport(ready=True, rates={"a": 30.0, "b": math.inf}, rendered={"a": 3, "b": 0}, dropped=1)
     receiver.report(report)
     sender.wait(1.0)
     assert sender.reports() == [report]

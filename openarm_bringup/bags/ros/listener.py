@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rclpy.node import Node
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.subscription import Subscription
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -21,7 +20,7 @@ from openarm_bringup.bags.losses import Arrivals
 from openarm_bringup.messages import interface
 from openarm_common.camera.cameras import depth_cameras, hand_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.node import offered_qos
+from openarm_common.ros.node import BaseNode, offered_qos
 from openarm_common.ros.polled import Unspun
 
 _ROBOT = "/joint_states|/tf|/tf_static|/clock|/robot_description"
@@ -77,7 +76,7 @@ class Listener:
 
     def __init__(
         self,
-        node: Node,
+        node: BaseNode[Any],
         patterns: tuple[str, ...],
         put: Callable[[Topic | Message], None],
         *,
@@ -114,8 +113,9 @@ class Listener:
             if any(pattern.fullmatch(topic) for pattern in self._wanted):
                 if self._node.count_publishers(topic):
                     self._subscribe(topic, kinds[0])
-            elif any(pattern.fullmatch(topic) for pattern in self._on_demand):
+            elif topic not in self._followed and any(pattern.fullmatch(topic) for pattern in self._on_demand):
                 self._followed[topic] = kinds[0]
+                self._node.take_images_at(0.0, [topic])
 
     def drain(self) -> None:
         """Take what has come; join who asks for a topic on demand, and leave with the last."""

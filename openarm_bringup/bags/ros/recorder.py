@@ -20,9 +20,9 @@ from openarm_bringup.bags.bag import BagWriter, Message, Topic, check_room
 from openarm_bringup.bags.ros.listener import Listener
 from openarm_bringup.supervision.discovery import PROFILE
 from openarm_bringup.supervision.environment import profiled
-from openarm_bringup.supervision.ports import held
 from openarm_bringup.supervision.shm import without_reader
 from openarm_common.errors import OpenArmError
+from openarm_common.ports import held
 from openarm_common.resources import config_dir
 from openarm_common.ros.client import ContextNode
 

@@ -14,13 +14,12 @@ from collections.abc import Mapping, Sequence
 from rcl_interfaces.srv import ListParameters
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
-from std_msgs.msg import Empty
 from std_srvs.srv import Trigger
 
 from openarm_bringup.messages import interface
 from openarm_bringup.supervision.graph import Ready
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.actions import RCLError, Watch, alive_topic
+from openarm_common.ros.actions import Watch
 from openarm_common.ros.client import ContextNode
 
 #: Time that a service gets to answer before it is asked again, s.
@@ -55,19 +54,10 @@ class ReadinessClient(ContextNode):
         return tuple(str(condition) for condition in conditions if not self._met(condition, old))
 
     def silence(self, node: str) -> float:
-        """Return for how long a node whose process lives has shown no sign of life, s; 0 while it does.
-
-        Its middleware shows that it lives: a node that computes for long does not become silent. When all are silent,
-        it is this probe that hears nothing: 0.
-        """
-        try:
-            if node not in self._watches:
-                self._watches[node] = Watch(self._node, Empty, alive_topic(f"/{node}"), node)
-            self._spin()
-        except RCLError:  # there is no memory, say: nothing is known of it
-            return 0.0
-        silences = [watch.silence for watch in self._watches.values() if watch.alive or watch.silence]
-        return 0.0 if all(silences) else self._watches[node].silence
+        """Return for how long a node whose process lives has shown no sign of life, s."""
+        if node not in self._watches:
+            self._watches[node] = Watch(self._node, "", node, f"/{node}")
+        return self._watches[node].silence
 
     def parameters(self, node: str, timeout_s: float = 20.0) -> frozenset[str]:
         """Return the names of a node's parameters.

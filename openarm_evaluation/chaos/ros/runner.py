@@ -21,12 +21,12 @@ import yaml
 from openarm_bringup.supervision import environment, shm
 from openarm_bringup.supervision.graph import Graph, load_graph
 from openarm_bringup.supervision.keeper import NodeState
-from openarm_bringup.supervision.ports import in_domain
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_bringup.supervision.state import socket_path, state_dir
 from openarm_bringup.supervision.supervisor import Supervisor
 from openarm_common.domain import release_domain, reserve_domain
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ports import in_domain
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, SceneObject, random_scene
 from openarm_evaluation.chaos import judge

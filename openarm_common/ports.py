@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""UDP ports of nodes that died, kept from their successors.
+"""UDP ports of processes that died, kept from their successors.
 
 Fast DDS numbers its ports in shared memory as those of UDP, and takes the lowest that are free. A process that is
 started again would get the numbers of the one that was killed, while all others still write into the memory of that
