@@ -74,6 +74,7 @@ class ForkServer:
     async def close(self) -> None:
         """End the server; its nodes go on."""
         self._channel.close()
+        self.process.kill()  # it has nothing to tidy up, and may be in the middle of an import
         await self.process.wait()
         _adopt_orphans(False)
 

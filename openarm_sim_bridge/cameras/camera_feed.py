@@ -204,21 +204,20 @@ class CameraFeed:
         self._held.close()
 
     def _start(self, spare: SpareProcess | None = None) -> None:
-        ours, theirs = pair() if spare is None else (spare.ours, None)
+        self._process, ours = (spare, spare.ours) if spare is not None else self._spawned()
         with self._lock:
             self._sender = StateSender(ours, self._setup)
             self._sender.offer(self._first, ())
             if self._faults:
                 self._sender.faults(self._faults)
-        if spare is None and theirs is not None:
-            command = [sys.executable, "-m", _MODULE, str(theirs.fileno())]
-            with theirs:
-                self._process = subprocess.Popen(
-                    command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=self._environ
-                )
-        elif spare is not None:
-            self._process = spare
         self._died_at = None
+
+    def _spawned(self) -> tuple[subprocess.Popen[bytes], socket.socket]:
+        ours, theirs = pair()
+        with theirs:
+            command = [sys.executable, "-m", _MODULE, str(theirs.fileno())]
+            process = subprocess.Popen(command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, env=self._environ)
+        return process, ours
 
     def _on_death(self) -> None:
         with self._lock:
