@@ -46,9 +46,11 @@ def ros_environment(graph: Graph, environ: Mapping[str, str] = os.environ) -> di
     return variables(domain_id(graph, environ), graph.discovery)
 
 
-def profile_of(graph: Graph) -> Path:
-    """Return the Fast DDS profile of a process that meets the graph, and publishes nothing large."""
-    return network_profile() if graph.discovery in ACROSS_MACHINES else config_dir() / "fastdds_small.xml"
+def profile_of(graph: Graph, environ: Mapping[str, str] = os.environ) -> str:
+    """Return the Fast DDS profile of a process that publishes nothing large; a user's own comes first."""
+    if graph.discovery in ACROSS_MACHINES:
+        return str(network_profile())
+    return environ.get(PROFILE) or str(config_dir() / "fastdds_small.xml")
 
 
 def client_environment(graph: Graph, run_dir: Path, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
@@ -65,7 +67,7 @@ def client_environment(graph: Graph, run_dir: Path, environ: Mapping[str, str] =
     }
     env.pop("ROS_LOCALHOST_ONLY", None)  # deprecated, and would override the discovery range
     env.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "[{severity}] {message}")
-    env[PROFILE] = str(profile_of(graph))
+    env[PROFILE] = profile_of(graph, environ)
     # The nodes share few cores; a pool of BLAS threads in each would only fight over them.
     for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         env.setdefault(key, "1")

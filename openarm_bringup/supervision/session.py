@@ -37,7 +37,7 @@ async def running_graph(
     Yields:
         The supervisor, while the nodes are still starting: `await supervisor.wait_ready()`.
     """
-    ros = {**environment.ros_environment(graph), environment.PROFILE: str(environment.profile_of(graph))}
+    ros = {**environment.ros_environment(graph), environment.PROFILE: environment.profile_of(graph)}
 
     def make_probe() -> Probe:
         from openarm_bringup.supervision.ros.readiness import ReadinessClient

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from openarm_interfaces.msg import ImageRates
 from rclpy.node import Node
 
+from openarm_common.ros.actions import full_name
 from openarm_common.ros.node import IMAGE_RATES, QOS_STATIC_TF
 from openarm_common.ros.polled import Polled, Source
 
@@ -36,7 +37,6 @@ class WantedRates:
             self._rates |= {(message.node, t): rate for t, rate in zip(message.topics, message.rates, strict=False)}
 
     def of(self, topics: Iterable[str]) -> float:
-        """Return the largest rate that a subscriber of any of these topics takes, Hz: infinite: all; 0: nobody."""
+        """Return the largest rate at which any of these topics is subscribed to, Hz: infinite: all; 0: not at all."""
         subscribers = [(info, t) for t in topics for info in self._node.get_subscriptions_info_by_topic(t)]
-        names = [(f"{info.node_namespace.rstrip('/')}/{info.node_name}", topic) for info, topic in subscribers]
-        return max((self._rates.get(name, math.inf) for name in names), default=0.0)
+        return max((self._rates.get((full_name(info), topic), math.inf) for info, topic in subscribers), default=0.0)

@@ -42,7 +42,7 @@ class RobotStateListener:
     """Keeps a `PostureTracker` filled.
 
     Joint states wait in the middleware until they are asked for: a node that woke for each would spend more time on
-    waking than on its work. Who is to be told of each at once calls `watch`.
+    waking than on its work. A user that acts on each at once calls `watch`.
 
     Args:
         node: The node that subscribes.

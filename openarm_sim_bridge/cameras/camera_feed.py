@@ -88,7 +88,7 @@ class CameraFeed:
     On a machine that is too slow for all frames, fewer are drawn; simulated time does not wait for them.
 
     Attributes:
-        rates: Frames a second of each camera that are drawn at present, Hz; 0: nobody needs one.
+        rates: Frames a second of each camera that are drawn at present, Hz; 0: no subscriber needs one.
         rendered: Frames drawn so far, by camera.
         lost: Frames that could not be handed over.
         fault: Why there are no images.
@@ -178,7 +178,7 @@ class CameraFeed:
             self._on_death()
 
     def _pace(self) -> None:
-        """Draw as often as somebody needs, and as the machine can."""
+        """Draw at the rate that subscribers need and the machine can draw."""
         share = self._share.update(sum(self.rendered.values()), self.dropped)
         for camera in self._setup.cameras:
             rate = min(self._wanted(camera), max(_LEAST_HZ, share * camera.rate))
@@ -191,7 +191,7 @@ class CameraFeed:
 
     @property
     def limited(self) -> str:
-        """Says which cameras the machine does not draw as often as somebody needs; empty when it does."""
+        """Says which cameras the machine does not draw as often as subscribers need; empty when it does."""
         wanted = ((camera.name, self._wanted(camera)) for camera in self._setup.cameras)
         slow = [f"{name} at {self.rates[name]:.0f} of {hz:.0f} Hz" for name, hz in wanted if self.rates[name] < hz]
         return f"this machine draws no faster: {', '.join(slow)}" if slow else ""

@@ -57,7 +57,7 @@ class CameraReport:
     Attributes:
         ready: A frame of every camera was drawn, it can begin.
         fault: Why it can't draw.
-        rates: At which a camera is subscribed to, Hz: infinite: all its frames; 0: nobody needs one.
+        rates: At which a camera is subscribed to, Hz: infinite: all its frames; 0: no subscriber needs one.
         rendered: Frames drawn so far, by camera.
         dropped: Frames that newer ones replaced before they were drawn.
         draw_ms: Mean time of the frames drawn since the last report.

@@ -25,7 +25,7 @@ from openarm_sim_bridge.ros.camera_publisher import CameraPublisher
 NODE_NAME = "mujoco_cameras"
 #: Period in which subscribers are counted and the bridge gets a report, s.
 _REPORT_S = 0.2
-#: Of the process, below that of the bridge; what is busy beside it leaves it a quarter of a processor.
+#: Of the process, below that of the bridge; one busy process leaves it a quarter of a processor.
 _NICE = 5
 
 

@@ -256,7 +256,7 @@ def test_diagnostics_report_how_well_it_keeps_up(seeing) -> None:
     seeing.ros.spin_until(lambda: expected <= set(values()), what=f"a status with {', '.join(sorted(expected))}")
 
 
-def test_a_camera_is_drawn_as_often_as_somebody_needs(seeing) -> None:
+def test_a_camera_is_drawn_at_the_rate_that_its_subscribers_need(seeing) -> None:
     got = seeing.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
     eye, topic, images = seeing.ros.add(BaseNode("eye", Config)), "/overhead/depth/image_raw", []
 

@@ -121,6 +121,8 @@ def test_only_publishers_of_large_messages_get_the_large_segment(graph: Graph, t
     assert all(
         "<leaseDuration><sec>4</sec>" in Path(env["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text() for env in (eye, arm)
     )
+    own = node_environment(graph, "arm", tmp_path, {"FASTRTPS_DEFAULT_PROFILES_FILE": "/mine.xml"})
+    assert own["FASTRTPS_DEFAULT_PROFILES_FILE"] == "/mine.xml"
     assert eye["ROS_DOMAIN_ID"] == arm["ROS_DOMAIN_ID"] == "9"
     assert eye["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert "ROS_LOCALHOST_ONLY" not in eye
