@@ -41,7 +41,7 @@ class Lifeline:
 
     def beat(self) -> None:
         """Show that this process works."""
-        with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(OSError):  # nobody waits, or it has ended
             while True:
                 self._watchers.append(self._socket.accept()[0])
         for watcher in tuple(self._watchers):

@@ -61,6 +61,13 @@ class Fault:
         path = root / self.file
         return path.is_file() and path.read_text(encoding="utf-8").count(self.old) == 1
 
+    def nearest_first(self, root: Path) -> list[str]:
+        """Return the test files of a tree, those that import the module first; an older tree may have fewer."""
+        paths = [path for test in self.tests for path in sorted({root / test, *root.glob(f"{test}/**/test_*.py")})]
+        module = self.file.removesuffix(".py").replace("/", ".")
+        files = dict.fromkeys(str(path.relative_to(root)) for path in paths if path.is_file())
+        return sorted(files, key=lambda file: module not in (root / file).read_text(encoding="utf-8"))
+
     def apply(self, root: Path) -> None:
         """Change a tree; numba, which looks for changes in one file only, forgets what it compiled."""
         path = root / self.file
@@ -99,7 +106,7 @@ def try_fault(fault: Fault, original: Path, *, long: bool) -> Row:
         original: Root of the tree, which stays as it is.
         long: Whether tests that are marked `long` are run, too.
     """
-    tests = [test for test in fault.tests if (original / test).exists()]  # an older tree may have fewer
+    tests = fault.nearest_first(original)
     if not fault.applies(original) or not tests:
         return Row(fault.package, fault.id, "not run")
     with tempfile.TemporaryDirectory(prefix="openarm_fault_", ignore_cleanup_errors=True) as folder:

@@ -5,8 +5,8 @@ An invalid trajectory (unknown joints, NaN, out of limits, …) is accepted as a
 result can carry the reason to the client: `error_code` INVALID_GOAL or INVALID_JOINTS and `error_string`.
 
 A client that publishes the id of its goal on `owner` has the arm hold when it dies: at once where it is of this machine
-and has a lifeline of that name, else when discovery has forgotten it. For other clients goals run to their end, as with
-ros2_control.
+and has a lifeline of that name, else when discovery has forgotten it. One with a lifeline also has it hold when it
+hangs. For other clients goals run to their end, as with ros2_control.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ from openarm_control.ros.controller_server import ControllerServer
 from openarm_control.trajectory import Trajectory, TrajectoryError, TrajectoryResult
 
 FEEDBACK_PERIOD_S = 0.05
+#: A client of this machine that shows no sign of life for so long while its goal runs is stopped, or hangs, s.
+_SILENT_S = 2.0
 
 
 class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
@@ -76,19 +78,30 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         on_trajectory: Any = self._on_trajectory  # rclpy awaits coroutines; its type hints do not allow them
         node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", on_trajectory, QOS_COMMAND)
         self._owner_topic = owner_topic(f"{controller}/follow_joint_trajectory")
-        #: The goal of an owner of another machine, and how many publish there.
-        self._owned, self._owners = b"", 0
+        #: The goal of an owner, its lifeline (None: of another machine), and how many publish there.
+        self._owned = b""
+        self._lifeline: lifeline.Watched | None = None
+        self._owners = 0
         node.create_subscription(GoalInfo, self._owner_topic, self._on_owner, latest())
 
     def _on_owner(self, info: GoalInfo) -> None:
         """Take note of a goal that may run only while its owner lives."""
         goal = bytes(info.goal_id.uuid)
-        local = lifeline.watch(goal.hex(), lambda: self._lose(goal, "the client of the goal has ended"))
-        self._owned, self._owners = b"" if local else goal, self._node.count_publishers(self._owner_topic)
+        self._lifeline = lifeline.watch(goal.hex(), lambda: self._lose(goal, "the client of the goal has ended"))
+        self._owned, self._owners = goal, self._node.count_publishers(self._owner_topic)
 
     def _check_owner(self) -> None:
-        if self._owned and self._node.count_publishers(self._owner_topic) < self._owners:
-            self._lose(self._owned, "the client of the goal is gone")
+        """Hold when the owner of the goal that runs hangs, or is of another machine and gone."""
+        if not self._owned:
+            return
+        if self._lifeline is not None:
+            lost = self._lifeline.silence >= _SILENT_S
+            why = f"the client of the goal has shown no sign of life for {_SILENT_S:g} s"
+        else:
+            lost = self._node.count_publishers(self._owner_topic) < self._owners
+            why = "the client of the goal is gone"
+        if lost:
+            self._lose(self._owned, why)
             self._owned = b""
 
     def _lose(self, goal: bytes, why: str) -> None:
@@ -153,10 +166,10 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         self._states.publish(message)
 
     def _publish_feedback(self) -> None:
-        self._check_owner()
         state = self._arm.state
         if self._running is not None and state is not None:
             self._running.publish_feedback(_feedback(self._arm.group.names, state))
+            self._check_owner()
 
 
 def trajectory_of(goal: FollowJointTrajectory.Goal) -> Trajectory:

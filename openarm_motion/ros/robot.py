@@ -127,7 +127,7 @@ class Controller:
         return self._client.server_is_ready()
 
     def start(self, motion: Motion, begin_ns: int) -> _Goal:
-        """Send a trajectory; its stamp is where it begins. The arm holds when this process dies."""
+        """Send a trajectory; its stamp is where it begins. The arm holds when this process dies or hangs."""
         message = trajectory_to_msg(motion.names, motion.t, motion.q, motion.v, motion.a)
         message.header.stamp = ns_to_stamp(begin_ns)
         info = GoalInfo(goal_id=self._goal_id())
@@ -175,7 +175,8 @@ class _Goal:
             self._handle.cancel_goal_async()
 
     def on_feedback(self, message: Any) -> None:
-        """Take note of the beginning, from a controller that says how far along the trajectory it is."""
+        """Show that this process works, and take note of the beginning where a controller says how far along it is."""
+        self._lifeline.beat()
         elapsed_ns = stamp_to_ns(message.feedback.desired.time_from_start)
         if not self._since_ns and elapsed_ns > 0:
             self._since_ns = stamp_to_ns(message.feedback.header.stamp) - elapsed_ns

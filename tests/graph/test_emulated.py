@@ -26,8 +26,9 @@ ENOUGH_HZ = 4.0
 
 @pytest.fixture(scope="module")
 def up(start_graph: Any) -> Any:
-    """The graph, ready, which lets a busy machine detect and answer late; motors go on in real time on any machine."""
-    settings = ("grasp.detect.max_age=3.0", "openarm_hardware.motors.silent=250")
+    """The graph, ready, which lets a busy machine detect and move late; motors go on in real time on any machine."""
+    late = ("motors.silent=250", "trajectory.path_tolerance=0.3", "motors.tracking=0.5")
+    settings = ("grasp.detect.max_age=3.0", *(f"openarm_hardware.{setting}" for setting in late))
     graph = start_graph("real", "--emulate", *(word for setting in settings for word in ("--set", setting)))
     graph.wait_ready()
     measured = graph.openarm("topic", "hz", "/detections_3d", "--domain", str(graph.domain), "--json")

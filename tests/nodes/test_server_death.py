@@ -240,14 +240,14 @@ def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> 
     client.destroy()
 
 
-def holds_after(bench, children) -> float:
-    """Kill the process that sent a trajectory; returns the simulated time until the arm rests, short of its end, s."""
+def holds_after(bench, children, number: signal.Signals) -> float:
+    """End or stop the process that sent a trajectory; returns the simulated time until the arm rests on its way, s."""
     there = [bench.HOME[0] + 2.0, *bench.HOME[1:]]
     owner = children.start(OWNER, ",".join(map(str, bench.arm)), ",".join(map(str, there)))
     column = bench.joints[-1].name.index(bench.ARM[0])
     bench.ros.spin_until(lambda: bench.joints[-1].velocity[column] > 0.25, 120.0, "the arm to move")
     bench.spin_sim(0.3)
-    owner.kill()
+    owner.send_signal(number)
     killed_ns = bench.node._simulation.robot.state.t_ns
     rests = lambda: abs(bench.joints[-1].velocity[column]) < 0.01  # noqa: E731
     bench.ros.spin_until(rests, what="the arm to rest")
@@ -261,12 +261,13 @@ def holds_after(bench, children) -> float:
 
 @pytest.mark.long
 @pytest.mark.requirement("R-21")
-def test_an_arm_holds_when_the_process_is_killed_that_sent_its_trajectory(bench, children) -> None:
-    holds_after(bench, children)
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_an_arm_holds_when_the_process_ends_or_hangs_that_sent_its_trajectory(bench, children, number) -> None:
+    holds_after(bench, children, number)
 
 
 @pytest.mark.long
 @pytest.mark.alone
 @pytest.mark.requirement("R-21")
 def test_an_arm_holds_at_once_when_the_process_is_killed_that_sent_its_trajectory(bench, children) -> None:
-    assert holds_after(bench, children) <= 0.2
+    assert holds_after(bench, children, signal.SIGKILL) <= 0.2
