@@ -149,8 +149,9 @@ class NodeProcess:
     async def _end_rest_of_group(self) -> None:
         """Kill grandchildren that outlived the process; they had its signals already."""
         for _ in range(100):
-            self._bury_orphans()
-            if not group_alive(self.pid):
+            alive = group_alive(self.pid)
+            self._bury_orphans()  # after the look: none that has ended by then stays a zombie
+            if not alive:
                 return
             self.kill()
             await asyncio.sleep(0.02)

@@ -309,17 +309,18 @@ class _Run:
         motion = executor.create_task(
             self._move, q, self._config.delay_velocity_scale, lambda: self._stopped() or seen >= _ENOUGH_MOVING
         )
-        while not motion.done() and seen < _ENOUGH_MOVING:
-            self._report("delay", f"{seen} images of the moving arm")
-            try:
-                t_ns, matched, detection, _ = await node.observe(moving=True)
-            except OpenArmError as error:
-                if error.code not in _NO_SAMPLE:
-                    raise
-                continue
-            if matched.speed > node.config.gate.max_speed:
-                both.take(t_ns, matched, detection)
-                seen = len(both) - begun
+        with node.capture.listening():
+            while not motion.done() and seen < _ENOUGH_MOVING:
+                self._report("delay", f"{seen} images of the moving arm")
+                try:
+                    t_ns, matched, detection, _ = await node.observe(moving=True)
+                except OpenArmError as error:
+                    if error.code not in _NO_SAMPLE:
+                        raise
+                    continue
+                if matched.speed > node.config.gate.max_speed:
+                    both.take(t_ns, matched, detection)
+                    seen = len(both) - begun
         await motion
         self._check()
         if seen < _FEWEST_MOVING:

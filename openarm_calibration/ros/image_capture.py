@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import cv2
@@ -38,6 +39,7 @@ class ImageCapture:
     def __init__(self, node: BaseNode[Any], states: RobotStateListener, name: str, config: CalibrationConfig) -> None:
         self._node, self._states, self._name, self._config = node, states, name, config
         self._refusal: OpenArmError | None = None
+        self._listeners = 0
         topics = {
             "image": (Image, f"/{name}/color/image_raw"),
             "camera_info": (CameraInfo, f"/{name}/color/camera_info"),
@@ -46,6 +48,18 @@ class ImageCapture:
         self._stream = CameraStream(
             node, states, topics, joints="required", pose_of=node.description.base, on_refusal=self._refuse
         )
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Stay subscribed while the context is open: images after the first one come at the rate of the camera."""
+        self._listeners += 1
+        self._stream.listen(True)
+        try:
+            yield
+        finally:
+            self._listeners -= 1
+            if not self._listeners:
+                self._stream.listen(False)
 
     async def state(self) -> dict[str, float]:
         """Wait for the newest joint state, rad or m.
@@ -69,23 +83,22 @@ class ImageCapture:
         Raises:
             OpenArmError: NOT_READY, when no image comes in time; STALE_DATA, when no joint state comes at its stamp.
         """
-        config, buffer = self._config, self._states.buffer
+        config = self._config
         window_ns = round(config.gate.window * 0.5e9)
         taken: list[Frame[Any]] = []
         self._refusal = None
 
         def arrived() -> bool:
             frame = self._stream.take()
-            if frame is not None and buffer.between(0, frame.t_ns - window_ns):
+            if frame is not None and self._states.buffer.between(0, frame.t_ns - window_ns):
                 taken.append(frame)
             return bool(taken) or self._refusal is not None
 
-        self._stream.listen(True)
-        try:
+        with self.listening():
             await wait_until(self._node, arrived, config.image_timeout + config.state_timeout)
             if taken:
                 end_ns = taken[0].t_ns + round(after * 1e9)
-                await wait_until(self._node, lambda: buffer.settled(end_ns), config.state_timeout)
+                await wait_until(self._node, lambda: self._states.buffer.settled(end_ns), config.state_timeout)
                 return taken[0]
             silent = self._stream.frames.silent or ["image with a joint state at its stamp"]
             raise self._refusal or OpenArmError(
@@ -93,8 +106,6 @@ class ImageCapture:
                 f"no {' and no '.join(silent)} of {self._name!r} within"
                 f" {config.image_timeout + config.state_timeout:g} s; is /{self._name}/color/image_raw published?",
             )
-        finally:
-            self._stream.listen(False)
 
     def _refuse(self, error: OpenArmError) -> None:
         self._refusal = error

@@ -189,7 +189,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         limited = images.limited if images is not None else ""
         report = self.diagnose_warning if limited and not fault else partial(self.diagnose, not fault)
         report(
-            fault or limited or ("paused" if simulation.paused else "running"),
+            "; ".join(filter(None, (fault, limited))) or ("paused" if simulation.paused else "running"),
             real_time_factor=f"{factor:.3f}",
             joint_state_period_p50_ms=f"{period.p50_ms:.2f}",
             joint_state_period_p99_ms=f"{period.p99_ms:.2f}",

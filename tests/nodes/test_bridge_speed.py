@@ -85,8 +85,8 @@ def test_fewer_images_are_drawn_where_the_machine_is_too_slow_and_time_goes_on(b
 
     bench.ros.spin_until(lambda: 0.0 < rate() < 60.0, what="fewer images")
     text = r"this machine draws no faster: overhead at \d+ of 100 Hz"
-    assert re.fullmatch(text, reports[-1].status[0].message)
-    assert reports[-1].status[0].level == DiagnosticStatus.WARN
+    assert re.search(text, reports[-1].status[0].message)
+    assert reports[-1].status[0].level != DiagnosticStatus.OK
     factors.clear()
     bench.ros.spin_until(lambda: len(factors) > 3, what="the real-time factor")
     assert np.median([factor.data for factor in factors]) > 0.95

@@ -7,14 +7,17 @@ import os
 import signal
 import sys
 import textwrap
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import psutil
 import pytest
 
+from openarm_bringup.supervision import process
 from openarm_bringup.supervision.graph import NodeSpec, Ready, Restart
 from openarm_bringup.supervision.keeper import NodeState
+from tests.conftest import DEADLINE_S
 
 sys.path.insert(0, str(Path(__file__).parent))
 from test_supervisor import Running, gone, in_loop, running
@@ -73,10 +76,10 @@ async def test_nodes_are_processes_of_their_own(tmp_path: Path, toys: Callable[.
         await run.supervisor.wait_ready()
         pids = {name: run.supervisor.pid(name) for name in ("left", "right")}
         for name, pid in pids.items():
-            process = psutil.Process(pid)
-            assert process.ppid() == os.getpid(), "the supervisor learns of its end by itself"
+            node = psutil.Process(pid)
+            assert node.ppid() == os.getpid(), "the supervisor learns of its end by itself"
             assert os.getsid(pid) == os.getpgid(pid) == pid, "signals of the terminal do not reach it"
-            assert process.name() == name
+            assert node.name() == name
             assert log(tmp_path, name) == [f"{name} forked 1 time.sleep(600)", "stdin ''"]
         forks = server(run).pid
     assert [gone(pid) for pid in (*pids.values(), forks)] == [True] * 3
@@ -93,6 +96,34 @@ async def test_a_node_that_is_killed_is_forked_again(tmp_path: Path, toys: Calla
         assert run.supervisor.pid("arm") != first
         assert any("ended by signal 9" in event.detail for event in run.events)
         assert log(tmp_path, "arm")[2].startswith("arm forked")
+
+
+@in_loop
+async def test_what_a_killed_node_had_started_leaves_no_zombie(
+    tmp_path: Path, toys: Callable[..., dict[str, NodeSpec]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "child"
+
+    def ended(group: int) -> bool:
+        """Its last process ends while it is looked for."""
+        child = psutil.Process(int(file.read_text()))
+        if child.is_running() and os.getpgid(child.pid) == group:
+            child.kill()
+            deadline = time.monotonic() + DEADLINE_S
+            while child.status() != psutil.STATUS_ZOMBIE:
+                assert time.monotonic() < deadline
+        return False
+
+    start = f"pathlib.Path({str(file)!r}).write_text(str(__import__('subprocess').Popen(['sleep', '600']).pid))"
+    async with running(tmp_path, toys("arm", does=f"{start}; time.sleep(600)")) as run:
+        await run.supervisor.wait_ready()
+        await run.until(lambda: file.is_file() and file.read_text() != "")
+        child = psutil.Process(int(file.read_text()))
+        monkeypatch.setattr(process, "group_alive", ended)
+        os.kill(run.supervisor.pid("arm"), signal.SIGKILL)
+        await run.until(lambda: NodeState.BACKOFF in run.seen("arm"))
+        monkeypatch.undo()
+        assert not child.is_running()
 
 
 @in_loop
