@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m openarm_bringup.warm`: compile the numba kernels once, so that no node waits for them."""
+"""`python -m openarm_bringup.warm [first]`: compile the numba kernels once, so that no node waits for them.
+
+`first`: those that the first pick of an object of known shape needs. The others are compiled when they are first used,
+which the log of the node says.
+"""
 
 from __future__ import annotations
 
+import gc
 import os
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
-from openarm_calibration.warm import warm as warm_calibration
+from openarm_calibration import warm as calibration
 from openarm_common.collision.self_collision import SelfCollision
 from openarm_common.robot.description import RobotDescription
-from openarm_grasp.warm import warm as warm_grasp
-from openarm_motion.warm import warm as warm_motion
-from openarm_octomap.warm import warm as warm_octomap
-from openarm_perception.warm import warm as warm_perception
+from openarm_grasp import warm as grasp
+from openarm_motion import warm as motion
+from openarm_octomap import warm as octomap
+from openarm_perception import warm as perception
 
 
 def warm_hardware() -> None:
@@ -22,14 +28,19 @@ def warm_hardware() -> None:
     SelfCollision(description, [name for arm in description.arms.values() for name in arm.controlled])
 
 
-#: The dearest first.
-PARTS = (warm_motion, warm_octomap, warm_grasp, warm_perception, warm_calibration, warm_hardware)
+#: What the first pick needs, and the rest; the dearest first.
+FIRST = (motion.warm_collision, octomap.warm, motion.warm_kinematics)
+REST = (calibration.warm, octomap.warm_rest, grasp.warm, perception.warm, warm_hardware)
 
 
 def main() -> None:
-    """Warm all packages that have kernels, in as many processes as there are processors."""
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=get_context("spawn")) as pool:
-        for part in [pool.submit(part) for part in PARTS]:
+    """Warm packages that have kernels, in as many processes as there are processors."""
+    parts = FIRST if sys.argv[1:] == ["first"] else (*FIRST, *REST)
+    # The collector would look at the many objects of numba again and again.
+    with ProcessPoolExecutor(
+        len(os.sched_getaffinity(0)), mp_context=get_context("spawn"), initializer=gc.disable
+    ) as pool:
+        for part in [pool.submit(part) for part in parts]:
             part.result()
 
 

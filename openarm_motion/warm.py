@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiles every numba kernel of this package, so that the first plan of a process does not wait for that."""
+"""Compile every numba kernel of this package, so that the first plan of a process does not wait for that."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from openarm_motion.planning.rrt import warm_search
 from openarm_motion.timing.trajectory import JointLimits, time_polyline
 
 
-def warm() -> None:
-    """Run each kernel once with the types that the package uses; the compiled code is cached next to the sources."""
+def warm_kinematics() -> None:
+    """Run the kernels of postures and speeds once with the types that the package uses."""
     description = RobotDescription.load()
     name, parts = next(iter(description.arms.items()))
     kinematics = ArmKinematics(description, parts.tcp)
@@ -35,14 +35,18 @@ def warm() -> None:
     away[2, 3] += 9.0
     inverse.solutions(away)  # what is out of reach has kernels of its own
     away[2, 3] = pose[2, 3] + 0.01
-    scene = CollisionScene(CollisionRobot(description, kinematics), CollisionContext(home))
-    warm_search(FastScene([scene]), q)
-    OccupancyMap(np.zeros((1, 3), np.int64), Lattice(0.02, (KEY_ZERO, KEY_ZERO, KEY_ZERO), (4, 4, 4)), 1).distances  # noqa: B018
+    solve_line(inverse, inverse.classify(q), pose, away, margin=0.0)
     limits = JointLimits(*np.ones((3, q.size)))
     segment_time(q, q + 0.01, limits)
     time_polyline(kinematics.names, np.stack([q, q + 0.01, q]), limits)
-    solve_line(inverse, inverse.classify(q), pose, away, margin=0.0)
 
 
-if __name__ == "__main__":
-    warm()
+def warm_collision() -> None:
+    """Run the kernels of collisions and of the search among them once."""
+    description = RobotDescription.load()
+    name, parts = next(iter(description.arms.items()))
+    home = description.group_state(f"{name}_arm", "home")
+    q = np.array([home[joint] for joint in parts.joints])
+    scene = CollisionScene(CollisionRobot(description, ArmKinematics(description, parts.tcp)), CollisionContext(home))
+    warm_search(FastScene([scene]), q)
+    OccupancyMap(np.zeros((1, 3), np.int64), Lattice(0.02, (KEY_ZERO, KEY_ZERO, KEY_ZERO), (4, 4, 4)), 1).distances  # noqa: B018

@@ -8,8 +8,8 @@ it does a second time changes nothing. The GIL is released.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from openarm_common.kernels import inlined_kernel, kernel
 from openarm_common.octree.block_kernels import (
     CELLS,
     EDGE,
@@ -34,7 +34,7 @@ from openarm_common.types import Array, Floats, Ints
 MISS, HIT = 0, 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _step(palette: Palette, kind: int, code: int, deltas: Floats, limits: Floats) -> int:
     """Return the code after a miss or hit, and remember it; FULL when there is no room for it."""
     value = palette.values[code]
@@ -47,7 +47,7 @@ def _step(palette: Palette, kind: int, code: int, deltas: Floats, limits: Floats
     return new
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def apply_marks(
     through: Words, hits: Words, begin: int, rows: Rows, palette: Palette, seen: Rows, now: int,
     deltas: Floats, limits: Floats, changed: Words,
@@ -125,7 +125,7 @@ def apply_marks(
     return rows.table.size
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def forget_shapes(
     kinds: Ints, halves: Array, T_shape_base: Array,
     resolution: float, key_min: Ints, shape: Ints, rows: Rows, palette: Palette, changed: Words,
@@ -184,14 +184,14 @@ def forget_shapes(
     return True
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _seen_at(seen: Rows, block: int, cell: int) -> int:
     """Return when an occupied cell was observed; 0 where it never was."""
     row = seen.table[8 * block + cell // 64]
     return int(seen.pool[row, cell % 64]) if row >= 0 else 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def forget_unseen(rows: Rows, palette: Palette, seen: Rows, limit: int, changed: Words) -> bool:
     """Make the occupied cells unknown that were not observed since a moment.
 
@@ -221,7 +221,7 @@ def forget_unseen(rows: Rows, palette: Palette, seen: Rows, limit: int, changed:
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def drop_seen(rows: Rows, palette: Palette, seen: Rows) -> None:
     """Take the rows of `seen` from where nothing is occupied any more."""
     for part in range(seen.table.size):
@@ -235,7 +235,7 @@ def drop_seen(rows: Rows, palette: Palette, seen: Rows) -> None:
             drop_row(seen, part, 0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tally(rows: Rows, palette: Palette, seen: Rows, counts: Ints) -> int:
     """Count cells by state into `counts` (3,); returns when the occupied cell was observed that has waited longest."""
     oldest = np.int64(1) << 62

@@ -10,10 +10,10 @@ keys are those of `octree.lattice`. What a scan marks are sets of cells, a bit e
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from openarm_common.camera.depth_view import DepthImage
+from openarm_common.kernels import inlined_kernel, kernel
 from openarm_common.octree.block_kernels import FREE as FREE
 from openarm_common.octree.block_kernels import OCCUPIED as OCCUPIED
 from openarm_common.octree.block_kernels import UNKNOWN as UNKNOWN
@@ -25,12 +25,12 @@ from openarm_common.types import Bytes, Floats, Ints
 Axes = tuple[Ints, ...]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _key(x: Whole, y: Whole, z: Whole) -> np.int64:
     return (np.int64(x) + 1048576) << 42 | (np.int64(y) + 1048576) << 21 | (np.int64(z) + 1048576)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _free_slot(x: Whole, y: Whole, z: Whole, table: Ints) -> Whole:
     """Where a cell belongs in a hash table of keys that are -1 where there is none; -1 when it is there already."""
     mask, key = table.size - 1, _key(x, y, z)
@@ -42,7 +42,7 @@ def _free_slot(x: Whole, y: Whole, z: Whole, table: Ints) -> Whole:
     return slot
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def image_ends(
     depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32,
     block: int, stride: int, reach: np.float32,
@@ -140,7 +140,7 @@ def image_ends(
     return m, valid, cleared
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _find_empty(
     depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32, label: Bytes,
     v0: int, block: int, empty: NDArray[np.bool_],
@@ -160,7 +160,7 @@ def _find_empty(
                     break
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cloud_ends(
     points: Floats, label: Bytes,
     resolution: float, key_min: Ints, origin: Floats, max_range: float,
@@ -212,17 +212,17 @@ def cloud_ends(
 _HUGE = 1.7976931348623157e308
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _centre(index: Whole, first: Whole, resolution: float) -> np.float32:
     return np.float32((np.float64(index + first - KEY_ZERO) + 0.5) * resolution)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _norm(x: np.float32, y: np.float32, z: np.float32) -> np.float64:
     return np.sqrt(np.float64(x * x + y * y + z * z))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_distance(x: Whole, y: Whole, z: Whole, key_min: Ints, resolution: float, origin: Floats) -> np.float64:
     """Return the distance of the centre of a cell (index) from a point (3,), m; as liboctomap computes it.
 
@@ -241,7 +241,7 @@ def cell_distance(x: Whole, y: Whole, z: Whole, key_min: Ints, resolution: float
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _first_step(
     index: Whole, first: Whole, origin: np.float32, direction: np.float32, resolution: float
 ) -> tuple[int, float, float]:
@@ -254,7 +254,7 @@ def _first_step(
     return step, (border - np.float64(origin)) / np.float64(direction), resolution / abs(np.float64(direction))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def walk_rays(
     ends: NDArray[np.int32], count: int, resolution: float, key_min: Ints, origin: Floats, max_range: float,
     axes: Axes, through: Words,

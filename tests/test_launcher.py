@@ -163,11 +163,11 @@ def test_kernels_that_a_pull_has_changed_are_compiled_before_anything_runs(machi
     kernels = machine.root / "openarm_motion" / "planning" / "kernels.py"
     compiled = kernels.parent / "__pycache__" / "kernels.search-1.nbc"
     compiled.parent.mkdir(parents=True)
-    kernels.write_text("from numba import njit\n")
+    kernels.write_text("@kernel\n")
     machine.run()
     compiled.touch()
     assert machine.run("x").stderr == ""
-    kernels.write_text("from numba import njit, prange\n")
+    kernels.write_text("@bare_kernel\n")
     answer = machine.run("x")
     assert "numba kernels have changed" in answer.stderr
     assert not compiled.exists()

@@ -73,7 +73,7 @@ class Fault:
         path = root / self.file
         text = path.read_text(encoding="utf-8")
         path.write_text(text.replace(self.old, self.new), encoding="utf-8")
-        if re.search(r"\bnjit\b|@kernel\b", text):
+        if re.search(r"\bnjit\b|kernel\b", text):
             for cached in root.glob("openarm_*/**/__pycache__/*.nb?"):
                 cached.unlink()
 

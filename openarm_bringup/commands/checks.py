@@ -46,6 +46,8 @@ def test(*args: Rest, every: Annotated[bool, Parameter(name="--all", negative=""
     command = [sys.executable, "-m", "pytest", "-q", *REPORT, *(["--all"] if every else []), *shared, *paths, *args]
     # Byte code is kept, whatever the environment says: the tests start a hundred processes.
     env = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    if shared:  # each process would compile the same kernels
+        subprocess.run([sys.executable, "-m", "openarm_bringup.warm"], cwd=root, env=env, check=False)
     code = subprocess.run(command, cwd=root, env=env, check=False).returncode
     seconds = time.monotonic() - began
     data = {"exit_code": code, "seconds": round(seconds, 1)}

@@ -11,9 +11,9 @@ where the camera has distortion, by k1, k2 of the radial polynomial `1 + k1 ρ²
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array
 
 Indices = NDArray[np.int64]
@@ -24,7 +24,7 @@ BEFORE_OPTICS = 7
 _NEAR = 1e-3
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark(
     p: Array, radius: float, T: Array, intrinsics: Array, scale: float, rows: Array, pixel: Array
 ) -> bool:  # pragma: no cover - compiled
@@ -87,7 +87,7 @@ def _mark(
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def normal_equations(
     points: Array,
     pixels: Array,
@@ -137,7 +137,7 @@ def normal_equations(
     return squares, slopes, costs
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project(
     points: Array, radius: float, pose: Array, intrinsics: Array, scale: float = 1.0
 ) -> Array:  # pragma: no cover - compiled
@@ -159,7 +159,7 @@ def project(
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def turned(R: Array, w: Array) -> Array:  # pragma: no cover - compiled
     """Return `exp(w) R` for a rotation vector w (3,)."""
     angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -171,7 +171,7 @@ def turned(R: Array, w: Array) -> Array:  # pragma: no cover - compiled
     return E @ R
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fit_poses(
     points: Array,
     pixels: Array,

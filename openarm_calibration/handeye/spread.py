@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array
 
 #: Below these a robot counts as exact: far less than a mark moves by, and the arithmetic stays well conditioned.
@@ -30,7 +30,7 @@ _LEVELS = np.geomspace(0.015, 240.0, 15)
 _BALANCES = np.geomspace(1.0 / 8.0, 8.0, 5)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cholesky(S: Array, L: Array) -> bool:  # pragma: no cover - compiled
     n = len(S)
     for i in range(n):
@@ -47,7 +47,7 @@ def _cholesky(S: Array, L: Array) -> bool:  # pragma: no cover - compiled
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def criterion(
     full: Array, KMK: Array, both: Array, translation: float, rotation: float
 ) -> float:  # pragma: no cover - compiled
@@ -103,7 +103,7 @@ def criterion(
     return logs + root[size - 1, size - 1] ** 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search(
     full: Array, KMK: Array, both: Array, start_t: float, start_r: float, whole: bool
 ) -> tuple[float, float]:  # pragma: no cover - compiled
@@ -147,7 +147,7 @@ def search(
     return best_t, best_r
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _with_misfit(
     parts: tuple[Array, Array, Array, Array, Array], views: int, px: float, t: float, r: float, misfit: float
 ) -> float:  # pragma: no cover - compiled
@@ -158,7 +158,7 @@ def _with_misfit(
     return 6.0 * views * np.log(level) + criterion(full, KMK * weight, both * weight, max(t, 1e-7), max(r, 1e-7))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search_misfit(
     parts: tuple[Array, Array, Array, Array, Array], views: int, px: float, start_t: float, start_r: float
 ) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
@@ -202,7 +202,7 @@ def search_misfit(
     return at_t, at_r, at_m, first - best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _answers(
     full: Array, KMK: Array, both: Array, spreads: Array, values: Array, answers: Array, covariances: Array
 ) -> None:  # pragma: no cover - compiled

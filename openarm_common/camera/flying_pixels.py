@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
 from openarm_common.camera.depth_view import DepthImage, DepthView
 from openarm_common.config import Config
+from openarm_common.kernels import kernel
 from openarm_common.types import Bytes
 
 #: Label of a pixel whose depth says nothing: it neither marks nor clears.
@@ -55,7 +55,7 @@ def label_flying(view: DepthView, config: FlyingConfig, label: Bytes) -> int:
     return int(label_lonely(view.depth, view.scale, near, far, per_metre, per_square, config.neighbours, label))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def label_lonely(
     depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32,
     share: np.float32, noise: np.float32, neighbours: int, label: Bytes,

@@ -6,13 +6,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.kernels import inlined_kernel
 from openarm_common.types import Array, Ints
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def place_bodies(
     q: Array, parents: Ints, placements: Array, axes: Array, prismatic: NDArray[np.bool_], frames: Array
 ) -> None:
@@ -49,7 +49,7 @@ def place_bodies(
             frames[i + 1, r, 3] = a3 + frames[p, r, 3] + along
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def put_shape(k: int, bodies: Ints, poses: Array, frames: Array, done: Ints, world: Array) -> None:
     """Bring a shape to where its body is, once a state."""
     b, now = bodies[k], done[done.shape[0] - 1]

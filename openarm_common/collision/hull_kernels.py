@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from openarm_common.collision.kernel import kernel
 from openarm_common.collision.shape_kernels import BOX, HULL, SPHERE
+from openarm_common.kernels import bare_kernel, inner_kernel
 from openarm_common.types import Array, Ints
 
 #: Steps at most; shapes that touch take the most.
@@ -19,7 +19,7 @@ _STEPS = 40
 _CLOSE, _ZERO = 1e-3, 1e-14
 
 
-@kernel
+@inner_kernel
 def _climb(tip: int, corners: Array, firsts: Ints, rings: Ints, x: float, y: float, z: float) -> int:
     """The corner of a hull that is furthest along a direction of its frame, by edges that lead there from `tip`."""
     most = corners[tip, 0] * x + corners[tip, 1] * y + corners[tip, 2] * z
@@ -35,7 +35,7 @@ def _climb(tip: int, corners: Array, firsts: Ints, rings: Ints, x: float, y: flo
         tip = best
 
 
-@kernel
+@inner_kernel
 def _furthest(
     k: int, tip: int, kinds: Ints, sizes: Array, corners: Array, firsts: Ints, rings: Ints, world: Array,
     x: float, y: float, z: float,
@@ -62,7 +62,7 @@ def _furthest(
     return px, py, pz, tip
 
 
-@kernel
+@bare_kernel
 def hull_separation(
     p: int, i: int, j: int, keep: float, enough: float, kinds: Ints, sizes: Array, corners: Array, firsts: Ints,
     rings: Ints, world: Array, axes: Array, tips: Ints, room: Array,
@@ -131,7 +131,7 @@ def hull_separation(
     return best
 
 
-@kernel
+@inner_kernel
 def _nearest(s: Array, count: int) -> tuple[int, float, float, float]:
     """Reduce a simplex (its first `count` rows) to the face that is nearest to the origin; its size and that point."""
     if count == 1:
@@ -171,7 +171,7 @@ def _nearest(s: Array, count: int) -> tuple[int, float, float, float]:
     return found, fx, fy, fz
 
 
-@kernel
+@inner_kernel
 def _on_segment(s: Array) -> tuple[int, float, float, float]:
     """As `_nearest`, of two points."""
     ux, uy, uz = s[1, 0] - s[0, 0], s[1, 1] - s[0, 1], s[1, 2] - s[0, 2]
@@ -185,13 +185,13 @@ def _on_segment(s: Array) -> tuple[int, float, float, float]:
     return 2, s[0, 0] + t * ux, s[0, 1] + t * uy, s[0, 2] + t * uz
 
 
-@kernel
+@inner_kernel
 def _keep(s: Array, to: int, k: int) -> None:
     for r in range(3):
         s[to, r] = s[k, r]
 
 
-@kernel
+@inner_kernel
 def _on_triangle(s: Array) -> tuple[int, float, float, float]:
     """As `_nearest`, of three points, by the regions about the triangle (Ericson, "Real-time collision detection")."""
     ax, ay, az = s[0, 0], s[0, 1], s[0, 2]

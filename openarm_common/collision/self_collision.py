@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from openarm_common import se3
@@ -16,6 +15,7 @@ from openarm_common.collision.body_kernels import place_bodies, put_shape
 from openarm_common.collision.hull_kernels import hull_separation
 from openarm_common.collision.hulls import Hull, joined_corners
 from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE, separation
+from openarm_common.kernels import kernel
 from openarm_common.robot.bodies import Bodies
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.urdf import Joint, Primitive
@@ -179,7 +179,7 @@ def _from_body(description: RobotDescription, link: str) -> Array:
     return T
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _measure(
     q: Array,
     tree: tuple[Ints, Array, Array, NDArray[np.bool_]],

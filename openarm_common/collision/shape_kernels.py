@@ -10,15 +10,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
-from openarm_common.collision.kernel import kernel
+from openarm_common.kernels import bare_kernel, inlined_kernel
 from openarm_common.types import Array, Ints
 
 BOX, CYLINDER, SPHERE, HULL = 0, 1, 2, 3
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _extent(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: float) -> float:
     """Half the extent of a shape of sizes s along a unit direction of its frame."""
     if kind == BOX:
@@ -28,7 +26,7 @@ def _extent(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: f
     return s0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _outside(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: float) -> float:
     """Distance of a point from a shape of sizes s, in its frame; < 0 inside."""
     if kind == BOX:
@@ -46,7 +44,7 @@ def _outside(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: 
     return math.sqrt(x * x + y * y + z * z) - s0
 
 
-@kernel
+@bare_kernel
 def separation(i: int, j: int, enough: float, kinds: Ints, sizes: Array, world: Array) -> float:
     """Distance that two shapes are proven to keep (< 0: they overlap no deeper); searched until it is `enough`.
 

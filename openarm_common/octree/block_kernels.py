@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.kernels import inlined_kernel, kernel
 from openarm_common.types import Bytes, Floats, Ints
 
 #: Levels of a block, cells along its edge, cells.
@@ -62,7 +62,7 @@ class Palette(NamedTuple):
     used: Ints
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def code_of(palette: Palette, value: np.float32) -> int:
     """Return the code of log-odds, a new one where there is none yet; FULL when there is no room for it."""
     if np.isnan(value):
@@ -87,7 +87,7 @@ def code_of(palette: Palette, value: np.float32) -> int:
     return code
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def codes_of(palette: Palette, values: Floats) -> Codes:
     """Return the codes of log-odds (n,), for all of which there is room."""
     out = np.empty(values.size, np.int32)
@@ -96,7 +96,7 @@ def codes_of(palette: Palette, values: Floats) -> Codes:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def take_row(rows: Rows, block: int) -> int:
     """Give a block a row, with whatever is in it; -1 when none is spare."""
     if rows.top[0] == 0:
@@ -107,7 +107,7 @@ def take_row(rows: Rows, block: int) -> int:
     return row
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def drop_row(rows: Rows, block: int, code: int) -> None:
     """Make all cells of a block one code, without a row."""
     row = rows.table[block]
@@ -117,7 +117,7 @@ def drop_row(rows: Rows, block: int, code: int) -> None:
     rows.table[block] = -1 - code
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def load_block(rows: Rows, block: int, cells: Codes) -> None:
     """Copy the codes of a block to `cells` (512,)."""
     row = rows.table[block]
@@ -129,7 +129,7 @@ def load_block(rows: Rows, block: int, cells: Codes) -> None:
             cells[i] = source[i]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def store_block(rows: Rows, block: int, cells: Codes) -> bool:
     """Write back the codes of a block; false, and nothing is changed, when it needs a row and none is spare."""
     first, differ = cells[0], 0
@@ -149,7 +149,7 @@ def store_block(rows: Rows, block: int, cells: Codes) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_box(rows: Rows, shape: Ints, first: Ints, last: Ints, code: int) -> bool:
     """Give all cells of a box one code.
 
@@ -178,19 +178,19 @@ def fill_box(rows: Rows, shape: Ints, first: Ints, last: Ints, code: int) -> boo
     return True
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def compact(i: int) -> int:
     """Return bits 0, 3 and 6: of the number of a cell in its block, the coordinate whose lowest bit is bit 0."""
     return (i & 1) | (i >> 2 & 2) | (i >> 4 & 4)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def spread(v: int) -> int:
     """Return three bits at places 0, 3 and 6: the inverse of `compact`."""
     return (v & 1) | (v & 2) << 2 | (v & 4) << 4
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def paint_blocks(
     rows: Rows, palette: Palette, shape: Ints, key_min: Ints, leaves: NDArray[np.int32], values: Floats, begin: int
 ) -> int:
@@ -239,7 +239,7 @@ def paint_blocks(
     return leaves.shape[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def recode(rows: Rows, codes: Codes, out: NDArray[Any]) -> None:
     """Replace each code by another.
 
@@ -257,7 +257,7 @@ def recode(rows: Rows, codes: Codes, out: NDArray[Any]) -> None:
                 out[row, i] = codes[rows.pool[row, i]]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_used(rows: Rows, used: Bytes) -> None:
     """Set `used` (capacity,) to 1 for each code that a cell has."""
     for block in range(rows.table.size):
@@ -269,7 +269,7 @@ def mark_used(rows: Rows, used: Bytes) -> None:
                 used[rows.pool[row, i]] = 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def expand(rows: Rows, shape: Ints, meaning: NDArray[Any], first: int, out: NDArray[Any]) -> None:
     """Fill a dense array with what codes mean.
 
@@ -295,7 +295,7 @@ def expand(rows: Rows, shape: Ints, meaning: NDArray[Any], first: int, out: NDAr
                             line[EDGE * bz + z] = meaning[code]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def gather(dense: Bytes, shape: Ints, rows: Rows) -> int:
     """Make blocks of a dense array of codes (8 nx, 8 ny, 8 nz); the block for which a row was missing, or how many."""
     cells = np.empty(CELLS, np.int32)
@@ -308,7 +308,7 @@ def gather(dense: Bytes, shape: Ints, rows: Rows) -> int:
     return rows.table.size
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def halve(rows: Rows, shape: Ints, states: Bytes, out: Bytes) -> None:
     """Fill `out` (4 nx, 4 ny, 4 nz) with the largest state of each 2 × 2 × 2 cells; `states` is (capacity,)."""
     for block in range(rows.table.size):

@@ -10,9 +10,9 @@ eight children in the array below. Child i of a node lies at ``x = i & 1, y = i 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.kernels import inlined_kernel, kernel
 from openarm_common.octree.block_kernels import CELLS, LEVEL, Palette, Rows
 from openarm_common.types import Bytes, Floats, Ints
 
@@ -23,7 +23,7 @@ TRUNCATED, TOO_DEEP = -1, -2
 Keys = NDArray[np.int32]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def merge_states(below: Bytes, above: Bytes, shift: Ints) -> None:
     """Fill one level from the one below.
 
@@ -48,7 +48,7 @@ def merge_states(below: Bytes, above: Bytes, shift: Ints) -> None:
                 row[k + shift[2]] = high if low == high else INNER
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def block_states(rows: Rows, states: Bytes, shape: Ints, above: Bytes, shift: Ints) -> int:
     """Fill level 3 with the states of blocks.
 
@@ -80,7 +80,7 @@ def block_states(rows: Rows, states: Bytes, shape: Ints, above: Bytes, shift: In
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fold_states(rows: Rows, states: Bytes, row: int, tree: Bytes) -> None:
     """Fill the nodes of a mixed block.
 
@@ -101,7 +101,7 @@ def _fold_states(rows: Rows, states: Bytes, row: int, tree: Bytes) -> None:
         tree[CELLS + i] = high if low == high else INNER
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _put_bits(tree: Bytes, first: int, out: Bytes, n: int) -> int:
     """Write two bits for each of eight children; returns how many there are."""
     bits, there = 0, 0
@@ -114,7 +114,7 @@ def _put_bits(tree: Bytes, first: int, out: Bytes, n: int) -> int:
     return there
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def write_states(
     rows: Rows, states: Bytes, blocks: Ints, flat: Bytes, offset: Ints, shape: Ints, origin: Ints, out: Bytes
 ) -> tuple[int, int]:
@@ -175,7 +175,7 @@ def write_states(
     return n, nodes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def read_states(
     data: Bytes, low: np.float32, high: np.float32, stack: Ints, at: Ints, leaves: Keys, values: Floats
 ) -> int:
@@ -222,7 +222,7 @@ def read_states(
     return m
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _merge_eight(states: Bytes, values: Floats, first: int) -> tuple[int, np.float32]:
     """Merge eight children that lie next to each other, as `merge_values` does."""
     count, leaves, best, same = 0, 0, np.float32(-np.inf), True
@@ -237,7 +237,7 @@ def _merge_eight(states: Bytes, values: Floats, first: int) -> tuple[int, np.flo
     return (0 if count == 0 else 1 if leaves == 8 and same else INNER), best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fold_values(rows: Rows, palette: Palette, row: int, tree: Bytes, values: Floats) -> tuple[int, np.float32]:
     """Do as `_fold_states` for log-odds: states (584,) as `merge_values` has them, and values (584,)."""
     codes = rows.pool[row]
@@ -250,7 +250,7 @@ def _fold_values(rows: Rows, palette: Palette, row: int, tree: Bytes, values: Fl
     return _merge_eight(tree, values, 576)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def block_values(rows: Rows, palette: Palette, shape: Ints, above: Bytes, above_values: Floats, shift: Ints) -> int:
     """Fill level 3 with the log-odds of blocks.
 
@@ -285,7 +285,7 @@ def block_values(rows: Rows, palette: Palette, shape: Ints, above: Bytes, above_
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def merge_values(below: Bytes, values: Floats, above: Bytes, above_values: Floats, shift: Ints) -> None:
     """Merge as `merge_states`, for leaves (state 1; 0 is unknown) with a value; an inner node has the largest one.
 
@@ -308,14 +308,14 @@ def merge_values(below: Bytes, values: Floats, above: Bytes, above_values: Float
                 above[x, y, z], above_values[x, y, z] = _merge_eight(eight, logs, 0)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _put_value(bits: int, mask: int, out: Bytes, n: int) -> None:
     for b in range(4):
         out[n + b] = bits >> 8 * b & 255
     out[n + 4] = mask
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _put_node(tree: Bytes, bits: Keys, node: int, below: int, out: Bytes, n: int) -> int:
     """Write a node of a block and how many bytes there are then; its children begin at `below`."""
     mask = 0
@@ -326,7 +326,7 @@ def _put_node(tree: Bytes, bits: Keys, node: int, below: int, out: Bytes, n: int
     return n + 5
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def write_values(
     rows: Rows, palette: Palette, blocks: Ints, flat: Bytes, bits: Keys, offset: Ints, shape: Ints, origin: Ints,
     out: Bytes,
@@ -399,7 +399,7 @@ def write_values(
     return n, n // 5
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def read_values(data: Bytes, stack: Ints, at: Ints, leaves: Keys, bits: Keys) -> int:
     """Read the next leaves of a tree of five bytes per node; as `read_states`.
 
@@ -438,7 +438,7 @@ def read_values(data: Bytes, stack: Ints, at: Ints, leaves: Keys, bits: Keys) ->
     return m
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def paint(leaves: Keys, values: Floats, key_min: Ints, shape: Ints, out: Floats) -> int:
     """Fill the cells of a box that leaves cover.
 

@@ -9,12 +9,12 @@ neighbours within reach, and skips lines that have nothing within it.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Bytes, Floats
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def along_z(states: Bytes, obstacle: int, cap: np.float32, out: Floats) -> None:
     """Compute squared distances along z to the nearest obstacle, cut at `cap`.
 
@@ -43,7 +43,7 @@ def along_z(states: Bytes, obstacle: int, cap: np.float32, out: Floats) -> None:
                 line[k] = min(line[k], d * d)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def along_y(squares: Floats, cap: np.float32, reach: int, scratch: Floats) -> None:
     """Run the second pass in place: all z of one row at a time, so that the inner loop runs over neighbours in memory.
 
@@ -75,7 +75,7 @@ def along_y(squares: Floats, cap: np.float32, reach: int, scratch: Floats) -> No
                     line[k] = candidate if candidate < line[k] else line[k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def along_x(squares: Floats, cap: np.float32, reach: int, edge: np.float32, scratch: Floats, ring: Floats) -> None:
     """Run the third pass in place, and convert to metres.
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from openarm_common.camera.depth_view import DepthImage
+from openarm_common.kernels import inlined_kernel, kernel
 from openarm_common.types import Array, Bytes, Floats, Ints
 
 Real = float | np.floating[Any]
@@ -24,7 +24,7 @@ BOX, CYLINDER, SPHERE = 0, 1, 2
 _PLANE = 0.02
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def inside(kind: Whole, x: Real, y: Real, z: Real, hx: Real, hy: Real, hz: Real) -> bool | np.bool_:
     """Whether a point lies in a shape of half edges (hx, hy, hz), both in the frame of the shape."""
     if kind == 0:
@@ -34,7 +34,7 @@ def inside(kind: Whole, x: Real, y: Real, z: Real, hx: Real, hy: Real, hz: Real)
     return x * x + y * y + z * z <= hx * hx
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _window(
     T: Array, half: Array, fx: float, fy: float, cx: float, cy: float, width: int, height: int
 ) -> tuple[int, int, int, int]:
@@ -74,7 +74,7 @@ def _window(
     return int(u0), int(u1) + 1, int(v0), int(v1) + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def label_image(
     depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32,
     ray_x: Floats, ray_y: Floats, fx: float, fy: float, cx: float, cy: float,
@@ -128,7 +128,7 @@ def label_image(
         counts[owners[i]] += n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _meets(dx: Real, dy: Real, dz: Real, x: Real, y: Real, z: Real, hx: Real, hy: Real, hz: Real) -> bool | np.bool_:
     """Whether the half-line from (x, y, z) along (dx, dy, dz) meets the box of half edges (hx, hy, hz)."""
     low, high = 0.0, 1e9
@@ -145,7 +145,7 @@ def _meets(dx: Real, dy: Real, dz: Real, x: Real, y: Real, z: Real, hx: Real, hy
     return low <= high
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def label_points(
     points: Floats, kinds: Ints, halves: Array, T_shape_base: Array, owners: Ints, label: Bytes, counts: Ints
 ) -> None:

@@ -154,6 +154,10 @@ class BaseNode(Node, Generic[ConfigT]):
         )
         self.__diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
         show_life(self)
+        if "numba" in sys.modules:
+            from openarm_common.compiling import announce  # numba is imported by nodes that have kernels
+
+            announce(self.get_logger().info)
         self.create_timer(self.REPORT_PERIOD_S, self.__publish_diagnostics, clock=self.steady_clock)
 
     @property

@@ -4,9 +4,9 @@
 An invalid trajectory (unknown joints, NaN, out of limits, …) is accepted as a goal and aborted at once, because only a
 result can carry the reason to the client: `error_code` INVALID_GOAL or INVALID_JOINTS and `error_string`.
 
-A client that publishes the id of its goal on `owner` has the arm hold when it dies: at once where it is of this machine
-and has a lifeline of that name, else when discovery has forgotten it. One with a lifeline also has it hold when it
-hangs. For other clients goals run to their end, as with ros2_control.
+A client of this machine with a lifeline by the id of its goal has the arm hold when it ends or hangs. One of another
+machine publishes the id on `owner`: the arm holds when discovery has forgotten it. For other clients goals run to their
+end, as with ros2_control.
 """
 
 from __future__ import annotations
@@ -78,31 +78,23 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         on_trajectory: Any = self._on_trajectory  # rclpy awaits coroutines; its type hints do not allow them
         node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", on_trajectory, QOS_COMMAND)
         self._owner_topic = owner_topic(f"{controller}/follow_joint_trajectory")
-        #: The goal of an owner, its lifeline (None: of another machine), and how many publish there.
-        self._owned = b""
+        #: Of the client of the goal that runs, if it is of this machine.
         self._lifeline: lifeline.Watched | None = None
-        self._owners = 0
+        #: The newest goal of an owner, and how many publish there.
+        self._owned, self._owners = b"", 0
         node.create_subscription(GoalInfo, self._owner_topic, self._on_owner, latest())
 
     def _on_owner(self, info: GoalInfo) -> None:
         """Take note of a goal that may run only while its owner lives."""
-        goal = bytes(info.goal_id.uuid)
-        self._lifeline = lifeline.watch(goal.hex(), lambda: self._lose(goal, "the client of the goal has ended"))
-        self._owned, self._owners = goal, self._node.count_publishers(self._owner_topic)
+        self._owned, self._owners = bytes(info.goal_id.uuid), self._node.count_publishers(self._owner_topic)
 
-    def _check_owner(self) -> None:
-        """Hold when the owner of the goal that runs hangs, or is of another machine and gone."""
-        if not self._owned:
-            return
+    def _check_owner(self, goal: bytes) -> None:
+        """Hold when the client of the goal that runs hangs, or is of another machine and gone."""
         if self._lifeline is not None:
-            lost = self._lifeline.silence >= _SILENT_S
-            why = f"the client of the goal has shown no sign of life for {_SILENT_S:g} s"
-        else:
-            lost = self._node.count_publishers(self._owner_topic) < self._owners
-            why = "the client of the goal is gone"
-        if lost:
-            self._lose(self._owned, why)
-            self._owned = b""
+            if self._lifeline.silence >= _SILENT_S:
+                self._lose(goal, f"the client of the goal has shown no sign of life for {_SILENT_S:g} s")
+        elif goal == self._owned and self._node.count_publishers(self._owner_topic) < self._owners:
+            self._lose(goal, "the client of the goal is gone")
 
     def _lose(self, goal: bytes, why: str) -> None:
         """Hold: nothing watches the motion any more."""
@@ -135,7 +127,8 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
     async def _execute(self, handle: ServerGoalHandle) -> FollowJointTrajectory.Result:
         try:
             trajectory = self._arm.check(trajectory_of(handle.request))
-            self._running = handle
+            self._running, goal = handle, bytes(handle.goal_id.uuid)
+            self._lifeline = lifeline.watch(goal.hex(), lambda: self._lose(goal, "the client of the goal has ended"))
             self._feedback_timer.reset()
             outcome = await self._follow(handle, lambda done: self._start(trajectory, done))
         except OpenArmError as error:
@@ -169,7 +162,7 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         state = self._arm.state
         if self._running is not None and state is not None:
             self._running.publish_feedback(_feedback(self._arm.group.names, state))
-            self._check_owner()
+            self._check_owner(bytes(self._running.goal_id.uuid))
 
 
 def trajectory_of(goal: FollowJointTrajectory.Goal) -> Trajectory:

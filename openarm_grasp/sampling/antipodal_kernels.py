@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array, Bytes, Floats, Ints
 from openarm_grasp.sampling.voxel_kernels import FILLED, FREE, OTHER, SEEN
 
@@ -39,7 +39,7 @@ COLUMNS = 26
 WIDTH, NARROW, TOUCH, ALIGN, SURE, UNSEEN, SLOPE, LEVER, ASIDE, TILT, BLIND, ROOM, PAIR, OPENING = range(12, 26)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cell(cells: Bytes, x: float, y: float, z: float) -> int:
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
     if i < 0 or j < 0 or k < 0 or i >= cells.shape[0] or j >= cells.shape[1] or k >= cells.shape[2]:
@@ -47,7 +47,7 @@ def _cell(cells: Bytes, x: float, y: float, z: float) -> int:
     return cells[i, j, k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pair(
     cells: Bytes, normals: Floats, px: float, py: float, pz: float, dx: float, dy: float, dz: float, last: float,
     widest: float, near: float, least_cos: float, out: Array, count: int,
@@ -70,7 +70,7 @@ def _pair(
     return count + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pairs(cells: Bytes, normals: Floats, starts: Ints, lean: float, widest: float, least_cos: float, out: Array) -> int:
     """Find opposite contacts: from each start through the object, level and along the normal.
 
@@ -121,7 +121,7 @@ def pairs(cells: Bytes, normals: Floats, starts: Ints, lean: float, widest: floa
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _hits(obstacles: Bytes, hand: Array, T: Array, px: float, py: float, pz: float, floor: float, stride: int) -> int:
     """Return how many points of a hand (n, 3), turned as T and at p, are in the target's shadow.
 
@@ -148,7 +148,7 @@ def _hits(obstacles: Bytes, hand: Array, T: Array, px: float, py: float, pz: flo
     return blind
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _between(cells: Bytes, T: Array, pad: Array, opening: float, first: Array, last: Array) -> bool:
     """March between the open pads: where each ray first and last meets the target; NaN where it does not.
 
@@ -178,7 +178,7 @@ def _between(cells: Bytes, T: Array, pad: Array, opening: float, first: Array, l
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unseen(cells: Bytes, x: float, y: float, z: float, dx: float, dy: float, dz: float) -> int:
     """How far a contact may lie farther out (d): voxels of shadow before it; 0 for one that was seen."""
     if _cell(cells, x, y, z) == SEEN:
@@ -189,7 +189,7 @@ def _unseen(cells: Bytes, x: float, y: float, z: float, dx: float, dy: float, dz
     return _MOST_UNSEEN
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turn(pad: Array, first: Array, last: Array) -> float:
     """Slope of the sides of the object across the pads, by least squares: dy / dx, mean of both sides."""
     low, high = math.inf, -math.inf
@@ -214,7 +214,7 @@ def _turn(pad: Array, first: Array, last: Array) -> float:
     return total / sides if sides else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _touch(cells: Bytes, normals: Floats, T: Array, pad: Array, first: Array, last: Array, out: Array) -> bool:
     """Measure the contact patches of both pads: the columns of `found` from WIDTH to SLOPE."""
     low, high = math.inf, -math.inf
@@ -281,7 +281,7 @@ def _touch(cells: Bytes, normals: Floats, T: Array, pad: Array, first: Array, la
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _frame(d: Array, angle: float, T: Array) -> bool:
     """Write a rotation whose y is d and whose z is turned about d by an angle from straight down."""
     level = d[0] * d[0] + d[1] * d[1]
@@ -298,7 +298,7 @@ def _frame(d: Array, angle: float, T: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def search(
     cells: Bytes, obstacles: Bytes, normals: Floats, found_pairs: Array, hypotheses: Array, hand: Array, pads: Array,
     tips: Array, opening: float, finger_step: float, clearance: float, back: float, centre: Array, widest: float,

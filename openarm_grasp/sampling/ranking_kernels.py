@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array, Ints
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def inside(points: Array, R: Array, p: Array, planes: Array, starts: Ints, low: Array, high: Array) -> bool:
     """Whether any of points (n, 3) is in the hand at (R, p); low, high: (3,) bounds of the hand in its frame."""
     for n in range(points.shape[0]):
@@ -32,7 +32,7 @@ def inside(points: Array, R: Array, p: Array, planes: Array, starts: Ints, low: 
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def distinct(found: Array, apart: float, least_cos: float, best: int) -> Ints:
     """Return the indices of rows (sorted, best first) that no better one resembles: TCP within `apart`, turned less."""
     kept = np.empty(best, np.int64)

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from openarm_common import se3
+from openarm_common.kernels import kernel
 from openarm_common.types import Array
 from openarm_common.walls import wall_yaw
 from openarm_grasp.planning.candidates import Box
@@ -92,7 +92,7 @@ def _cut(points: Array, step: float) -> _Cut:
     return _Cut(float(saved[axis, place]), int(axis), float(places[place, axis]))
 
 
-@njit(cache=True)
+@kernel
 def _between_cuts(points: Array, places: Array) -> tuple[Array, Array]:
     """Lowest and highest coordinates (3, n + 1, 3) of what lies between n places (n, 3) along each axis.
 

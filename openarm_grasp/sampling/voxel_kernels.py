@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array, Bytes, Floats, Ints
 
 #: What a voxel holds: nothing; the target as it was seen; what is below a seen point of it; the same of everything
@@ -27,7 +27,7 @@ _PASSED = 2
 Counts = NDArray[np.uint16]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def count(points: Array, counts: Counts) -> None:
     """Count the points (n, 3) in each voxel (nx, ny, nz)."""
     nx, ny, nz = counts.shape
@@ -37,7 +37,7 @@ def count(points: Array, counts: Counts) -> None:
             counts[i, j, k] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def heights(points: Array, nx: int, ny: int) -> Floats:
     """Return the height (nx, ny) of what stands in each column, NaN where nothing does.
 
@@ -65,7 +65,7 @@ def heights(points: Array, nx: int, ny: int) -> Floats:
     return _smooth(raw)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _close(raw: Floats) -> Floats:
     """Fill columns of which at least five of eight neighbours are known."""
     nx, ny = raw.shape
@@ -85,7 +85,7 @@ def _close(raw: Floats) -> Floats:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _smooth(raw: Floats) -> Floats:
     """Median over the known columns of 3 × 3; those with fewer than two neighbours become NaN."""
     nx, ny = raw.shape
@@ -106,7 +106,7 @@ def _smooth(raw: Floats) -> Floats:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill(target: Floats, others: Floats, counts: Counts, around: Counts, cells: Bytes) -> None:
     """Fill each column from what was seen downwards, to the table or to the next thing that was seen.
 
@@ -134,7 +134,7 @@ def fill(target: Floats, others: Floats, counts: Counts, around: Counts, cells: 
                     cells[i, j, k] = FILLED if mine else OTHER
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shade(points: Array, eye: Array, label: int, cells: Bytes) -> None:
     """Mark what is free and lies behind points (n, 3), seen from a camera at `eye` (3,), with a label."""
     nx, ny, nz = cells.shape
@@ -154,7 +154,7 @@ def shade(points: Array, eye: Array, label: int, cells: Bytes) -> None:
                 cells[i, j, k] = label
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def passed(points: Array, eye: Array, out: Bytes) -> None:
     """Count the rays from a camera at `eye` (3,) to points (n, 3) that pass each voxel, to at most `_PASSED`."""
     nx, ny, nz = out.shape
@@ -179,7 +179,7 @@ def passed(points: Array, eye: Array, out: Bytes) -> None:
             x, y, z = x + dx, y + dy, z + dz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def carve(rays: Bytes, around: Counts, cells: Bytes) -> None:
     """Free what rays have passed: guesses below what was seen, and shadows that another view looks into."""
     nx, ny, nz = cells.shape
@@ -192,7 +192,7 @@ def carve(rays: Bytes, around: Counts, cells: Bytes) -> None:
                     cells[i, j, k] = FREE
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def grow(cells: Bytes, out: Bytes) -> None:
     """Mark obstacles of the hand in `out`: 1 within a voxel of target or others, 3 hidden by others, 2 the shadow.
 
@@ -225,7 +225,7 @@ def grow(cells: Bytes, out: Bytes) -> None:
                             out[a, b, c] = 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def boundary(cells: Bytes) -> Ints:
     """Return the indices (n, 3) of voxels of the target that have a neighbour which is not, the table left out."""
     nx, ny, nz = cells.shape
@@ -247,6 +247,6 @@ def boundary(cells: Bytes) -> Ints:
     return found[:n].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_target(cell: int) -> bool:
     return cell in (SEEN, FILLED)

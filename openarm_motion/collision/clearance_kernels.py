@@ -13,13 +13,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from openarm_common.collision.body_kernels import place_bodies, put_shape
 from openarm_common.collision.hull_kernels import hull_separation
-from openarm_common.collision.kernel import kernel
 from openarm_common.collision.shape_kernels import BOX, HULL, separation
+from openarm_common.kernels import bare_kernel, inner_kernel, kernel
 from openarm_common.types import Array, Ints
 
 #: Numbers that a list of groups or intervals of a line has room for.
@@ -139,7 +138,7 @@ class Work(NamedTuple):
     simplex: Array
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def workspace(model: Model) -> Work:
     """Room for one thread."""
     n, s, c, g = model.parents.shape[0], model.kinds.shape[0], model.clusters.shape[0], model.groups.shape[0]
@@ -171,13 +170,16 @@ def workspace(model: Model) -> Work:
             work.tips[model.pairs.shape[0] + p, side] = model.tips[max(model.hulls[model.groups[p, side]], 0)]
     for k in range(s):  # what does not move is where it is
         if model.bodies[k] == 0:
-            world[k] = model.poses[k]
+            for i in range(3):
+                for j in range(4):
+                    world[k, i, j] = model.poses[k, i, j]
     for k in range(c):
-        middles[k] = model.centres[k]
+        for i in range(3):
+            middles[k, i] = model.centres[k, i]
     return work
 
 
-@kernel
+@inner_kernel
 def map_room(m: int, enough: float, model: Model, work: Work) -> float:
     """By how much a body is further from the map than it must be; searched until it is `enough`."""
     groups, spheres, shapes, keeps = model.sphere_groups, model.spheres, model.sphere_shapes, model.sphere_keep
@@ -224,7 +226,7 @@ def map_room(m: int, enough: float, model: Model, work: Work) -> float:
     return least
 
 
-@kernel
+@inner_kernel
 def map_distance(frame: Array, ball: Array, field: NDArray[np.float32], corner: Array, edge: Array) -> float:
     """Distance in the map at a ball's centre less its radius and what rounding to cells takes."""
     nx, ny, nz = field.shape
@@ -243,7 +245,7 @@ def map_distance(frame: Array, ball: Array, field: NDArray[np.float32], corner: 
 _CLOSE = 0.03
 
 
-@kernel
+@inner_kernel
 def place(q: Array, model: Model, work: Work) -> None:
     """Bring bodies and the centres of what moves with them to where they are in a state."""
     # fields are unpacked before loops here and below: each access costs a count of references
@@ -258,7 +260,7 @@ def place(q: Array, model: Model, work: Work) -> None:
     work.done[model.kinds.shape[0]] += 1
 
 
-@kernel
+@inner_kernel
 def sway(a: Array, b: Array, share: float, model: Model, work: Work) -> None:
     """Fill `Work.sways` about the state that bodies were placed for, for a share of the line from `a` to `b` (n,).
 
@@ -301,7 +303,7 @@ def sway(a: Array, b: Array, share: float, model: Model, work: Work) -> None:
             sways[c, body] = moved
 
 
-@kernel
+@inner_kernel
 def sift(sways: Array, model: Model, work: Work) -> int:
     """List the groups whose balls may come too near in an interval; returns how many. Bodies in the map are added.
 
@@ -334,7 +336,7 @@ def sift(sways: Array, model: Model, work: Work) -> int:
     return count
 
 
-@kernel
+@inner_kernel
 def check_listed(start: int, count: int, end: int, sways: Array, model: Model, work: Work) -> int:
     """Check listed groups (and bodies in the map) in the state that bodies were placed for.
 
@@ -431,14 +433,14 @@ def check_listed(start: int, count: int, end: int, sways: Array, model: Model, w
     return kept
 
 
-@kernel
+@bare_kernel
 def near(q: Array, model: Model, work: Work) -> bool:
     """Whether in a state (n,) something is not proven to be as far from all else as it must be."""
     place(q, model, work)
     return check_listed(0, sift(work.still, model, work), -1, work.still, model, work) < 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def states_free(states: Array, model: Model, out: NDArray[np.bool_]) -> None:
     """Whether each of the states (m, n) is proven free."""
     work = workspace(model)

@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array
 
 #: Turns a rotation error (rad) into a length (m) so that both can be minimised together: about the size of a hand.
@@ -27,7 +27,7 @@ _PULL = 0.05
 _STALL = 5
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def forward(
     q: Array,
     placements: Array,
@@ -87,7 +87,7 @@ def forward(
     out[3, 3] = 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def forward_many(
     configurations: Array, placements: Array, axes: Array, prismatic: NDArray[np.bool_], tip: Array
 ) -> Array:
@@ -101,7 +101,7 @@ def forward_many(
     return poses
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def jacobian(origins: Array, directions: Array, prismatic: NDArray[np.bool_], p: Array, out: Array) -> None:
     """Geometric Jacobian (6, n) at point `p`: linear rows first, base frame."""
     for i in range(origins.shape[0]):
@@ -117,7 +117,7 @@ def jacobian(origins: Array, directions: Array, prismatic: NDArray[np.bool_], p:
         out[3, i], out[4, i], out[5, i] = x, y, z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pose_error(target: Array, pose: Array, out: Array) -> None:
     """Position error and rotation vector (6,) that take `pose` to `target`, base frame."""
     e = np.empty((3, 3))
@@ -135,7 +135,7 @@ def _pose_error(target: Array, pose: Array, out: Array) -> None:
     out[3], out[4], out[5] = k * x, k * y, k * z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve_spd(h: Array, g: Array, x: Array) -> None:
     """Solve ``h x = g`` in place for a small symmetric positive definite `h` (lower triangle), by Cholesky."""
     n = g.shape[0]
@@ -157,7 +157,7 @@ def _solve_spd(h: Array, g: Array, x: Array) -> None:
         x[i] = s / h[i, i]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw(lower: Array, upper: Array, at_limits: bool, x: Array) -> None:
     """Draw a guess, uniform within the limits; `at_limits` puts about two joints of three on one of theirs."""
     for i in range(x.shape[0]):
@@ -167,7 +167,7 @@ def _draw(lower: Array, upper: Array, at_limits: bool, x: Array) -> None:
         x[i] = lower[i] + (upper[i] - lower[i]) * u
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solve_ik(
     target: Array,
     start: Array,

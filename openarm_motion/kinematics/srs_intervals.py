@@ -19,9 +19,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array
 from openarm_motion.kinematics.srs_kernels import fold, middle_zero, reduce_pose
 
@@ -33,7 +33,7 @@ _FOLDS = 4
 _TURN = 2.0 * math.pi
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _roots(c: float, a: float, b: float, at: Array, count: int) -> int:
     """Append the angles s with ``c + a cos s + b sin s = 0`` to `at`; returns the new count."""
     size = math.sqrt(a * a + b * b)
@@ -45,7 +45,7 @@ def _roots(c: float, a: float, b: float, at: Array, count: int) -> int:
     return count + 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _outer(sine: Array, cosine: Array, angle: float, at: Array, count: int) -> int:
     """Append the angles at which a joint is at `angle` or opposite; coefficients (3,) of its sine and cosine."""
     cs, sn = math.cos(angle), math.sin(angle)
@@ -54,7 +54,7 @@ def _outer(sine: Array, cosine: Array, angle: float, at: Array, count: int) -> i
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _arcs(turnings: Array, geometry: Array, lower: Array, upper: Array, at: Array) -> int:
     """Fill `at` (MOST + 1,) with the ends of the arcs, rising from one in [-pi, pi), the first again a turn later.
 
@@ -87,7 +87,7 @@ def _arcs(turnings: Array, geometry: Array, lower: Array, upper: Array, at: Arra
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _all_folds(
     turnings: Array, s: float, geometry: Array, lower: Array, upper: Array, whole: bool, q: Array, over: Array
 ) -> None:
@@ -117,7 +117,7 @@ def _all_folds(
         over[k] = max(over[k], a if k < 2 else b)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _keep(
     q: Array,
     q4: float,
@@ -137,7 +137,7 @@ def _keep(
     return count + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _missed(inside: NDArray[np.bool_], met: NDArray[np.bool_], ends: Array, arcs: int, middles: Array) -> int:
     """Fill `middles` with that of each run of arcs `inside` of which none is `met`; returns how many there are."""
     first, count, begin = 0, 0, 0.0
@@ -161,7 +161,7 @@ def _missed(inside: NDArray[np.bool_], met: NDArray[np.bool_], ends: Array, arcs
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sweep(
     pose: Array,
     swivels: Array,
@@ -225,7 +225,7 @@ def sweep(
     return count, 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def nearest(
     pose: Array,
     swivels: Array,
@@ -269,6 +269,6 @@ def nearest(
                 branch, e = elbow + 2 * f, max(over[f], bent)
                 if e < least[branch]:
                     least[branch], best_swivel[branch] = e, s
-                    best[branch] = q[f]
-                    best[branch, 3] = q4
+                    for i in range(7):
+                        best[branch, i] = q4 if i == 3 else q[f, i]
     return 0

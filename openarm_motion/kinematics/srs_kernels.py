@@ -23,8 +23,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array
 
 #: Why no configuration exists; 0 when one does.
@@ -34,7 +34,7 @@ LIMIT, JUMP = 3, 4
 BRANCHES = 8
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cross(a: Array, b: Array) -> Array:
     out = np.empty(3)
     out[0] = a[1] * b[2] - a[2] * b[1]
@@ -43,12 +43,12 @@ def _cross(a: Array, b: Array) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dot(a: Array, b: Array) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turn(w: Array, angle: float, v: Array) -> Array:
     """Turn vector `v` about the unit axis `w` (Rodrigues)."""
     c, s = math.cos(angle), math.sin(angle)
@@ -60,7 +60,7 @@ def _turn(w: Array, angle: float, v: Array) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _apply(r: Array, v: Array) -> Array:
     out = np.empty(3)
     for i in range(3):
@@ -68,14 +68,14 @@ def _apply(r: Array, v: Array) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _into(angle: float, lower: float, upper: float) -> float:
     """The turn of `angle` that lies nearest to the middle of a range."""
     middle = 0.5 * (lower + upper)
     return angle - 2.0 * math.pi * math.floor((angle - middle) / (2.0 * math.pi) + 0.5)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _swivel_frame(n: Array) -> tuple[Array, Array]:
     """Directions of the elbow at swivel 0 (lowest) and at a quarter turn, both perpendicular to `n`."""
     e = np.empty(3)
@@ -89,7 +89,7 @@ def _swivel_frame(n: Array) -> tuple[Array, Array]:
     return e, _cross(n, e)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turning(u: Array, n: Array, x: Array, out: Array) -> None:
     """Fill `out` (3,) with the c, a, b of ``u . exp(n s) x = c + a cos s + b sin s``."""
     out[0] = _dot(u, n) * _dot(n, x)
@@ -97,7 +97,7 @@ def _turning(u: Array, n: Array, x: Array, out: Array) -> None:
     out[2] = _dot(u, _cross(n, x))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turnings(n: Array, r: Array, w1: Array, w2: Array, w3: Array, out: Array) -> None:
     """Fill `out` (9, 3) with the coefficients of all that the angles of three joints with ``R = exp(n s) r`` need."""
     across, after = _cross(w1, w2), _cross(w2, w3)
@@ -113,7 +113,7 @@ def _turnings(n: Array, r: Array, w1: Array, w2: Array, w3: Array, out: Array) -
     _turning(across, n, normal, out[8])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def reduce_pose(
     pose: Array, bent: bool, geometry: Array, tool: Array, lower: Array, upper: Array, turnings: Array
 ) -> tuple[int, float]:
@@ -179,25 +179,27 @@ def reduce_pose(
     for j in range(3):
         for i in range(3):
             column[i] = r[0, i] * m[0, j] + r[1, i] * m[1, j] + r[2, i] * m[2, j]
-        wrist[:, j] = _turn(w4, -q4, column)
+        turned = _turn(w4, -q4, column)
+        for i in range(3):
+            wrist[i, j] = turned[i]
     _turnings(n, r, geometry[0], geometry[1], geometry[2], turnings[0])
     # seen from the forearm the hand turns the other way about the same line
     _turnings(-_turn(w4, -q4, v), wrist, geometry[4], geometry[5], geometry[6], turnings[1])
     return 0, q4
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def middle_zero(w1: Array, w2: Array, w3: Array) -> float:
     """Angle of the middle joint of three at which the outer axes w1 and w3 are parallel, rad."""
     return math.atan2(_dot(w1, _cross(w2, w3)), _dot(w1, w3))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _at(row: Array, cs: float, sn: float) -> float:
     return row[0] + row[1] * cs + row[2] * sn
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fold(
     turnings: Array,
     swivel: float,
@@ -246,7 +248,7 @@ def fold(
     return worst
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solve(
     pose: Array, swivel: float, branch: int, geometry: Array, tool: Array, lower: Array, upper: Array, q: Array
 ) -> int:
@@ -263,7 +265,7 @@ def solve(
     return status
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def swivel_of(q: Array, geometry: Array) -> float:
     """Swivel angle of a configuration, rad in (-pi, pi]."""
     w4 = geometry[3]
@@ -284,7 +286,7 @@ def swivel_of(q: Array, geometry: Array) -> float:
     return math.atan2(_dot(across, side), _dot(down, side))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _excess(q: Array, lower: Array, upper: Array) -> tuple[float, int]:
     """How far the worst joint is outside its limits (negative inside), and which joint."""
     worst, joint = -np.inf, 0
@@ -295,7 +297,7 @@ def _excess(q: Array, lower: Array, upper: Array) -> tuple[float, int]:
     return worst, joint
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def follow(
     poses: Array,
     swivels: Array,

@@ -6,9 +6,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from openarm_common.collision.kernel import kernel
+from openarm_common.kernels import bare_kernel, inner_kernel, kernel
 from openarm_common.types import Array, Ints
 from openarm_motion.collision.clearance_kernels import Model, Work, near
 from openarm_motion.collision.line_kernels import between_free, line_free
@@ -23,7 +22,13 @@ _UNIFORM, _FAR = 0.05, 6.0
 _TURNS = 20
 
 
-@kernel
+@inner_kernel
+def _copy(q: Array, out: Array) -> None:
+    for i in range(q.shape[0]):
+        out[i] = q[i]
+
+
+@inner_kernel
 def _nearest(tree: Array, count: int, q: Array) -> tuple[int, float]:
     best, at = np.inf, 0
     for k in range(count):
@@ -36,7 +41,7 @@ def _nearest(tree: Array, count: int, q: Array) -> tuple[int, float]:
     return at, math.sqrt(best)
 
 
-@kernel
+@inner_kernel
 def _draw(tree: Array, count: int, bounds: Array, sample: Array) -> None:
     """Draw a sample: mostly far away from a configuration of the tree in a random direction, cut off at the bounds.
 
@@ -57,7 +62,7 @@ def _draw(tree: Array, count: int, bounds: Array, sample: Array) -> None:
         sample[i] = min(max(tree[k, i] + far * sample[i], bounds[0, i]), bounds[1, i])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def grow(
     trees: Array,
     parents: Ints,
@@ -113,7 +118,7 @@ def grow(
         if near(new, model, work) or not between_free(trees[a, at], new, step, travel, levers, model, work):
             continue
         end = counts[a]
-        trees[a, end] = new
+        _copy(new, trees[a, end])
         parents[a, end] = at
         counts[a] += 1
         at, d = _nearest(trees[b], counts[b], new)
@@ -129,7 +134,7 @@ def grow(
                 break
             if not between_free(trees[b, at], sample, step, travel, levers, model, work):
                 break
-            trees[b, counts[b]] = sample
+            _copy(sample, trees[b, counts[b]])
             parents[b, counts[b]] = at
             at = counts[b]
             counts[b] += 1
@@ -137,7 +142,7 @@ def grow(
     return -1, -1, edges
 
 
-@kernel
+@inner_kernel
 def rest_to_rest(velocity: float, acceleration: float, jerk: float) -> float:
     """Shortest time over a length of one, from rest to rest, within the limits (per that length)."""
     # each half: the acceleration rises, stays, falls; the velocity stays in between
@@ -150,7 +155,7 @@ def rest_to_rest(velocity: float, acceleration: float, jerk: float) -> float:
     return 4.0 * (0.5 / jerk) ** (1.0 / 3.0)
 
 
-@kernel
+@bare_kernel
 def duration(a: Array, b: Array, limits: Array) -> float:
     """Time of a straight joint segment from rest to rest, s; `limits` (3, n) are velocity, acceleration, jerk."""
     velocity, acceleration, jerk = np.inf, np.inf, np.inf
@@ -162,7 +167,7 @@ def duration(a: Array, b: Array, limits: Array) -> float:
     return rest_to_rest(velocity, acceleration, jerk)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _skip(points: Array, count: int, resolution: Array, levers: Array, model: Model, work: Work) -> int:
     """Go from each way point to the furthest one that a free line reaches; returns how many are left."""
     i, kept = 0, 1
@@ -170,13 +175,13 @@ def _skip(points: Array, count: int, resolution: Array, levers: Array, model: Mo
         j = count - 1
         while j > i + 1 and not line_free(points[i], points[j], resolution[0], resolution[1], levers, model, work):
             j -= 1
-        points[kept] = points[j]
+        _copy(points[j], points[kept])
         kept += 1
         i = j
     return kept
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shorten(
     points: Array,
     count: int,
@@ -251,12 +256,12 @@ def shorten(
             continue
         if longer > 0:
             for k in range(count - 1, last, -1):
-                points[k + longer] = points[k]
+                _copy(points[k], points[k + longer])
         elif longer < 0:
             for k in range(last + 1, count):
-                points[k + longer] = points[k]
+                _copy(points[k], points[k + longer])
         for k in range(size):
-            points[first + k] = fresh[k]
+            _copy(fresh[k], points[first + k])
         count += longer
         idle = 0
     return _skip(points, count, resolution, levers, model, work)

@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array
 
 #: No piece is shorter, s: between samples that are nearer to each other positions are too coarse for a jerk.
@@ -27,7 +27,7 @@ _GRID, _SWEEPS, _LAST = 4, 4, 0.004
 _STARTS = 3
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def change(acceleration: float, jerk: float) -> tuple[float, float]:
     """Shortest change of velocity: time until the acceleration begins to fall, and time that it rises (and falls), s.
 
@@ -47,14 +47,14 @@ def change(acceleration: float, jerk: float) -> tuple[float, float]:
     return until, rise
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _change_time(speed: float, most: Array) -> float:
     """Time of a change of speed on a segment whose greatest speed, acceleration and jerk are `most`, s."""
     until, rise = change(abs(speed) / most[1], abs(speed) / most[2])
     return until + rise
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def segment(first: float, last: float, length: float, most: Array) -> tuple[float, float]:
     """Shortest time of a segment between two speeds, and the speed in its middle.
 
@@ -86,14 +86,14 @@ def segment(first: float, last: float, length: float, most: Array) -> tuple[floa
     return rise + fall + (length - 0.5 * ((first + peak) * rise + (peak + last) * fall)) / peak, peak
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _way(first: float, peak: float, last: float, most: Array) -> float:
     """Share of a segment that is gone while the speed goes from one to another by a peak that stays for `SPACING`."""
     rise, fall = _change_time(peak - first, most), _change_time(peak - last, most)
     return 0.5 * ((first + peak) * rise + (peak + last) * fall) + SPACING * peak
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def corner(before: Array, after: Array, speeds: Array, limits: Array) -> tuple[float, float]:
     """`change` in a corner between two segments (n,), with speeds (2,) before and after it."""
     acceleration, jerk = 0.0, 0.0
@@ -103,7 +103,7 @@ def corner(before: Array, after: Array, speeds: Array, limits: Array) -> tuple[f
     return change(acceleration, jerk)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _around(k: int, segments: Array, most: Array, speeds: Array, limits: Array) -> float:
     """Time of segment k with half of the corners at its ends, s."""
     m, head, tail = segments.shape[0], 0.0, 0.0
@@ -118,7 +118,7 @@ def _around(k: int, segments: Array, most: Array, speeds: Array, limits: Array) 
     return head + tail + segment(first, last, 1.0 - head * first - tail * last, most[k])[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _improve(
     c: int,
     new: tuple[float, float],
@@ -144,7 +144,7 @@ def _improve(
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def choose(segments: Array, most: Array, caps: Array, limits: Array) -> tuple[Array, float]:
     """Speeds before and after each corner (m - 1, 2) with which a polyline takes little time, and that time, s.
 
@@ -174,7 +174,7 @@ def choose(segments: Array, most: Array, caps: Array, limits: Array) -> tuple[Ar
     return chosen, least
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search(segments: Array, most: Array, caps: Array, limits: Array, speeds: Array, best: Array) -> None:
     """Improve speeds and the times of the segments in place."""
     count = segments.shape[0] - 1

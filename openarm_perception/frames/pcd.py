@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numba import njit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.kernels import kernel
 from openarm_common.types import Bytes
 from openarm_perception.geometry.depth import Points
 
@@ -213,7 +213,7 @@ def _words(data: bytes, head: _Header, path: Path) -> dict[str, NDArray[np.gener
     return out
 
 
-@njit(cache=True, nogil=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@kernel
 def unpack_lzf(data: Bytes, out: Bytes) -> int:
     """Unpack LZF data; return how many bytes were written, -1 for data that are damaged.
 

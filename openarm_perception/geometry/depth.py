@@ -11,13 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import DepthImage, check_size, unit_scale
 from openarm_common.config import Config
+from openarm_common.kernels import kernel
 from openarm_common.types import Array, Bytes, Mask
 
 Points = NDArray[np.float32]
@@ -36,7 +36,7 @@ class DepthLimits(Config):
         return self
 
 
-@njit(cache=True, nogil=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@kernel
 def _organise(
     depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32, ray_x: Points, ray_y: Points, out: Points
 ) -> None:
@@ -51,7 +51,7 @@ def _organise(
             out[v, u, 2] = z
 
 
-@njit(cache=True, nogil=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@kernel
 def _count(depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32) -> int:
     n = 0
     for v in range(depth.shape[0]):
@@ -62,7 +62,7 @@ def _count(depth: DepthImage, scale: np.float32, near: np.float32, far: np.float
     return n
 
 
-@njit(cache=True, nogil=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@kernel
 def _filter(
     depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32, ray_x: Points, ray_y: Points, out: Points
 ) -> None:

@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial import KDTree
@@ -21,6 +20,7 @@ from openarm_common.camera.depth_view import DepthImage, unit_scale
 from openarm_common.camera.flying_pixels import label_lonely
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.kernels import kernel
 from openarm_common.types import Ints
 from openarm_perception.geometry.depth import Points
 
@@ -102,7 +102,7 @@ def voxel_filter(points: Points, edge: float) -> Points:
     return (sums[:count, :3] / sums[:count, 3:]).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _collect(points: Points, inverse: float, table: Ints, cells: Ints, sums: NDArray[np.float64]) -> int:
     mask = table.size - 1
     count = 0

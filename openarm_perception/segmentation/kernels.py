@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.kernels import inlined_kernel, kernel
 from openarm_common.types import Array, Bytes, Mask
 from openarm_perception.geometry.depth import Points
 
@@ -28,14 +28,14 @@ EDGE = 8.0
 _LEVELS = 64
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _together(z: float, other: float, distance: float, noise: Real) -> bool:
     """Return whether two depths, so far apart in the image (as a tangent), may be of one surface."""
     near = min(z, other)
     return bool(abs(z - other) <= SLANT * distance * near + 4.0 * noise * near * near)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _smallest_axis(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> tuple[float, float, float]:
     """Return the direction in which a symmetric matrix is smallest: inverse iteration by its adjugate."""
     trace = xx + yy + zz
@@ -58,7 +58,7 @@ def _smallest_axis(xx: float, xy: float, xz: float, yy: float, yz: float, zz: fl
     return nx, ny, nz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _normal_at(points: Points, v: int, u: int, reach: int, noise: Real, out: Points) -> None:
     """Write the normal (3,) of the surface at a pixel, towards the camera, NaN of fewer than six points."""
     h, w, _ = points.shape
@@ -104,7 +104,7 @@ def _normal_at(points: Points, v: int, u: int, reach: int, noise: Real, out: Poi
     out[0], out[1], out[2] = nx, ny, nz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def local_normals(points: Points, step: int, reach: int, noise: np.float32) -> Points:
     """Return normals of every `step`-th pixel by a plane through the window around it, without what is beyond a break.
 
@@ -125,7 +125,7 @@ def local_normals(points: Points, step: int, reach: int, noise: np.float32) -> P
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def masked_normals(points: Points, wanted: Mask, reach: int, noise: np.float32) -> Points:
     """Return normals (h, w, 3) of the pixels that are wanted, as `local_normals`; NaN of the others."""
     h, w, _ = points.shape
@@ -139,7 +139,7 @@ def masked_normals(points: Points, wanted: Mask, reach: int, noise: np.float32) 
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def breaks(points: Points, wanted: Mask, pixel: float, noise: np.float32) -> Bytes:
     """Return where depth breaks: (h, w), 1: to the right neighbour, 2: to the lower one, 3: to both.
 
@@ -162,7 +162,7 @@ def breaks(points: Points, wanted: Mask, pixel: float, noise: np.float32) -> Byt
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def edge_strength(normals: Points, wanted: Mask, reach: int) -> Bytes:
     """Return how much the surface bends at pixels (h, w): the angle of normals left and right, above and below, deg."""
     h, w, _ = normals.shape
@@ -184,7 +184,7 @@ def edge_strength(normals: Points, wanted: Mask, reach: int) -> Bytes:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def grow_patches(strength: Bytes, broken: Bytes, wanted: Mask, size: int) -> Labels:
     """Divide pixels into patches of about `size` pixels across that end where the surface bends or depth breaks.
 
@@ -224,7 +224,7 @@ def grow_patches(strength: Bytes, broken: Bytes, wanted: Mask, size: int) -> Lab
     return label
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _seeds(strength: Bytes, wanted: Mask, size: int) -> Labels:
     """Return the flattest pixel of each cell, as row · width + column; none where the cells around are much flatter.
 
@@ -264,7 +264,7 @@ def _seeds(strength: Bytes, wanted: Mask, size: int) -> Labels:
     return out[:n]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined_kernel
 def _wait(entry: int, level: int, following: Labels, first: Labels, last: Labels) -> int:
     following[entry] = -1
     if first[level] < 0:
@@ -275,7 +275,7 @@ def _wait(entry: int, level: int, following: Labels, first: Labels, last: Labels
     return entry + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _flood(
     label: Labels, strength: Bytes, broken: Bytes, wanted: Mask, following: Labels, place: Labels, owner: Labels,
     first: Labels, last: Labels, waiting: int,
@@ -310,7 +310,7 @@ def _flood(
     return 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def patch_moments(points: Points, label: Labels, count: int) -> Array:
     """Return sums (count, 10) over the points of each patch: 1, x, y, z, xx, xy, xz, yy, yz, zz; patch 0 is none."""
     out = np.zeros((count, 10))
@@ -334,7 +334,7 @@ def patch_moments(points: Points, label: Labels, count: int) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def borders(label: Labels, broken: Bytes, points: Points) -> Labels:
     """Return (n, 3) a row per pair of neighbours with other labels: both, smaller first; break in depth, mm, or 0."""
     h, w = label.shape

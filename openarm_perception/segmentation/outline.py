@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.kernels import kernel
 from openarm_common.types import Array, Mask
 from openarm_perception.geometry.depth import Points
 
@@ -70,7 +70,7 @@ def survey(label: NDArray[np.uint16], points: Points, robot: Mask, noise: float)
     return tuple(Outline(*(float(v) for v in row)) for row in shares[1:])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _survey(label: NDArray[np.uint16], points: Points, robot: Mask, noise: np.float32, gap: int, count: int) -> Array:
     h, w = label.shape
     out = np.zeros((count + 1, 5))

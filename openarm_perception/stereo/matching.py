@@ -12,12 +12,12 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numba import njit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.kernels import kernel
 from openarm_common.types import Bytes, Floats
 from openarm_perception.geometry.depth import DepthLimits
 from openarm_perception.stereo.rectification import Rectification
@@ -145,7 +145,7 @@ class StereoMatcher:
         return np.ascontiguousarray(_inside(np.ascontiguousarray(found), self._least * _STEPS))
 
 
-@njit(cache=True, nogil=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@kernel
 def _inside(disparity: Disparities, least: int) -> Disparities:
     """Mark as -1 what has no match, or one outside the other image."""
     for v in range(disparity.shape[0]):
@@ -155,7 +155,7 @@ def _inside(disparity: Disparities, least: int) -> Disparities:
     return disparity
 
 
-@njit(cache=True, nogil=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@kernel
 def _check_back(disparity: Disparities, back: Disparities, most: int) -> None:
     """Mark as -1 what the match back contradicts, or does not confirm."""
     for v in range(disparity.shape[0]):
@@ -168,7 +168,7 @@ def _check_back(disparity: Disparities, back: Disparities, most: int) -> None:
                 disparity[v, u] = -1
 
 
-@njit(cache=True, nogil=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@kernel
 def _to_depth(disparity: Disparities, scale: np.float32, near: np.float32, far: np.float32, out: Floats) -> None:
     for v in range(disparity.shape[0]):
         for u in range(disparity.shape[1]):

@@ -240,8 +240,9 @@ def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> 
     client.destroy()
 
 
-def holds_after(bench, children, number: signal.Signals) -> float:
-    """End or stop the process that sent a trajectory; returns the simulated time until the arm rests on its way, s."""
+def holds_after(bridge, children, number: signal.Signals) -> float:
+    """End or stop the process that sent a trajectory; return the time until the arm rests on its way, s."""
+    bench = bridge(images=False, speed=1.0)
     there = [bench.HOME[0] + 2.0, *bench.HOME[1:]]
     owner = children.start(OWNER, ",".join(map(str, bench.arm)), ",".join(map(str, there)))
     column = bench.joints[-1].name.index(bench.ARM[0])
@@ -262,12 +263,12 @@ def holds_after(bench, children, number: signal.Signals) -> float:
 @pytest.mark.long
 @pytest.mark.requirement("R-21")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_an_arm_holds_when_the_process_ends_or_hangs_that_sent_its_trajectory(bench, children, number) -> None:
-    holds_after(bench, children, number)
+def test_an_arm_holds_when_the_process_ends_or_hangs_that_sent_its_trajectory(bridge, children, number) -> None:
+    holds_after(bridge, children, number)
 
 
 @pytest.mark.long
 @pytest.mark.alone
 @pytest.mark.requirement("R-21")
-def test_an_arm_holds_at_once_when_the_process_is_killed_that_sent_its_trajectory(bench, children) -> None:
-    assert holds_after(bench, children, signal.SIGKILL) <= 0.2
+def test_an_arm_holds_at_once_when_the_process_is_killed_that_sent_its_trajectory(bridge, children) -> None:
+    assert holds_after(bridge, children, signal.SIGKILL) <= 0.2

@@ -30,7 +30,8 @@ def test_all_tests_are_shared_out_a_file_each_and_what_is_said_last_holds(
     asked: list[list[str]], args: tuple[str, ...]
 ) -> None:
     assert checks.test(*args).success
-    (command,) = asked
+    compile_kernels, command = asked
+    assert compile_kernels[-1] == "openarm_bringup.warm"
     assert command[command.index("-n") + 1] == "3"
     assert {"--dist=loadfile", "--max-worker-restart=0"} < set(command)
     assert command[len(command) - len(args) :] == list(args)

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Say that numba compiles: the first caller of a kernel whose code is not kept yet waits for seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numba.core import event
+
+#: What numba calls the compilation of one function.
+_COMPILE = "numba:compile"
+
+
+class _Listener(event.Listener):
+    """Says once for each package that its kernels are being compiled."""
+
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say = say
+        self._said = set[str]()
+
+    def on_start(self, event: Any) -> None:
+        package = str(event.data["dispatcher"].py_func.__module__).rpartition(".")[0]
+        if package.startswith("openarm_") and package not in self._said:
+            self._said.add(package)
+            self._say(f"compiling kernels of {package}: once, and it takes some seconds")
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+def announce(say: Callable[[str], object]) -> None:
+    """Have it said when kernels are compiled in this process.
+
+    Args:
+        say: Gets a sentence for each package, in the thread that compiles.
+    """
+    event.register(_COMPILE, _Listener(say))
