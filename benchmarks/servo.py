@@ -328,7 +328,7 @@ async def measure(options: argparse.Namespace) -> list[Row]:
     folder = runs.new_run_dir()
     for name in ("logs", "params"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    sets = (f"mujoco_bridge.profile={options.profile}",)
+    sets = (f"mujoco_bridge.profile={options.profile}", "motion.servo.enabled=true")
     overrides: dict[str, Any] = {"domain": reserve_domain(), "scene": _SCENE}
     graph = load_graph("motion", overrides=overrides, sets=sets)
     found: list[dict[str, Any]] = []

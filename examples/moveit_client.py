@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pick an object and place it elsewhere, as a state machine of MoveIt's client pymoveit2.
 
-    ./openarm up
+    ./openarm up --moveit
     .venv/bin/python examples/moveit_client.py red --place 0.36 -0.20
 
 Detections come from the suite, everything else is asked of MoveIt's names: the object becomes a body of the planning

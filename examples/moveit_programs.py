@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each call that the documentation of pymoveit2 shows, one program after the other, before whatever robot runs.
 
-    ./openarm up motion --robot panda
+    ./openarm up motion --robot panda --moveit
     python examples/moveit_programs.py                     # names from the node move_group
     python examples/moveit_programs.py --preset panda      # names from pymoveit2.robots.panda
 

@@ -158,7 +158,7 @@ class FaultsConfig(Config):
 class MoveGroupConfig(Config):
     """The node `move_group`, which answers MoveIt's clients in the process of the motion node."""
 
-    enabled: bool = Field(default=True, description="whether it is there; false next to MoveIt's own")
+    enabled: bool = Field(default=False, description="whether it is there; it needs moveit_msgs (openarm up --moveit)")
     gripper: str = Field(default="/{arm}_gripper_controller/gripper_cmd", description="action that moves a hand")
     gripper_action: Literal["parallel", "classic"] = Field(
         default="parallel", description="its type: ParallelGripperCommand, or the older GripperCommand"
@@ -187,7 +187,9 @@ class ServoClearance(Clearance):
 class ServoConfig(Config):
     """How arms follow twists and joint velocities; names as MoveIt Servo has them."""
 
-    enabled: bool = Field(default=True, description="whether the node servo_node is there; false next to MoveIt's own")
+    enabled: bool = Field(
+        default=False, description="whether the node servo_node is there; it needs moveit_msgs (openarm up --moveit)"
+    )
     command_in_type: Literal["unitless", "speed_units"] = Field(
         default="unitless", description="unitless: -1 to 1, times scale; speed_units: m/s and rad/s"
     )

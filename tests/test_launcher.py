@@ -131,12 +131,25 @@ def test_set_up_hands_over_its_arguments_and_the_next_run_does_nothing(machine: 
     assert first.stdout == "args: demo --seeds 0-3\nPYTHONPATH: unset\n"
     assert "set up" in first.stderr
     calls = machine.uv_calls()
-    assert sum(call.startswith("build --wheel --no-build-isolation") for call in calls) == 7
+    assert sum(call.startswith("build --wheel --no-build-isolation") for call in calls) == 5
     assert any("pip sync" in call and "--require-hashes" in call for call in calls)
     assert list(machine.cache.glob("openarm/tmp.*")) == []
 
     second = machine.run("a b", "c")
     assert (second.stdout, second.stderr) == ("args: a b c\nPYTHONPATH: unset\n", "")
+    assert machine.uv_calls() == []
+
+
+@pytest.mark.parametrize("command", [("up", "motion", "--moveit"), ("test",)])
+def test_messages_of_moveit_are_built_when_they_are_first_wanted(machine: Machine, command: tuple[str, ...]) -> None:
+    machine.run("up")
+    machine.uv_calls()
+    answer = machine.run(*command)
+    assert answer.stdout.startswith(f"args: {' '.join(command)}\n")
+    built = [call.rsplit("/", 1)[1] for call in machine.uv_calls() if call.startswith("build")]
+    assert sorted(built) == ["moveit_msgs", "object_recognition_msgs"]
+    for again in (command, ("up",)):
+        assert machine.run(*again).stderr == ""
     assert machine.uv_calls() == []
 
 

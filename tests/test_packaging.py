@@ -85,8 +85,8 @@ def test_set_up_compiles_kernels_of_every_package_that_has_some() -> None:
 
 
 def test_every_interface_package_is_built_by_the_launcher() -> None:
-    (line,) = re.findall(r'^interfaces="(.*)"$', (_ROOT / "openarm").read_text(), re.MULTILINE)
-    assert sorted(line.split()) == _INTERFACES
+    lines = re.findall(r'^(?:interfaces|of_moveit)="(.*)"$', (_ROOT / "openarm").read_text(), re.MULTILINE)
+    assert sorted(" ".join(lines).split()) == _INTERFACES
 
 
 @pytest.mark.parametrize("package", _INTERFACES)

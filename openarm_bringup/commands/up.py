@@ -31,6 +31,7 @@ def up(
     viz: bool = False,
     viz_port: int = 8765,
     emulate: bool = False,
+    moveit: bool = False,
     robot: Robot = None,
 ) -> Outcome:
     """Start the nodes of a graph, and stop them at Ctrl-C (a second Ctrl-C: emergency stop, and hurry).
@@ -45,6 +46,7 @@ def up(
         viz: Offer every topic and service to Foxglove, at an address that is printed.
         viz_port: TCP port for that.
         emulate: Of the graph real: the simulated robot in place of motors and cameras, frame by frame.
+        moveit: Answer clients of MoveIt, too (nodes move_group and servo_node). The first time builds moveit_msgs.
     """
     choose_robot(robot)
     import asyncio
@@ -57,6 +59,8 @@ def up(
     overrides = {"scene": scene, "seed": seed, "mount_seed": mount_seed, "domain": domain, "discovery": discovery}
     of_viz = tuple(item for item in set_ if viz and item.startswith(f"{NODE}."))
     sets = [item for item in set_ if item not in of_viz]
+    if moveit:
+        sets = [*(f"motion.{node}.enabled=true" for node in ("move_group", "servo")), *sets]
     loaded = load_graph(graph, overrides=overrides, sets=sets, emulate=emulate)
     load_scene(loaded.scene, loaded.seed)  # a scene that does not fit is refused before anything starts
     address = ""

@@ -57,6 +57,19 @@ _FEEDBACK = 0.1
 _HOLD = 1.8
 
 
+def _adapter(module: str) -> Any:
+    """Import an adapter.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, without MoveIt's messages.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        text = f"there is no Python package {error.name}; ./openarm up --moveit builds it"
+        raise OpenArmError(Code.ENVIRONMENT, text) from error
+
+
 class MotionNode(BaseNode[MotionConfig]):
     """Plans and executes motions of each arm, and dual-arm motions."""
 
@@ -89,13 +102,15 @@ class MotionNode(BaseNode[MotionConfig]):
         self.create_service(GetScene, "/motion/get_scene", self._on_get)
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
         if config.move_group.enabled:
-            kind: Any = importlib.import_module(_MOVE_GROUP).MoveGroupNode
-            group = kind(self.service, config.move_group, config.controller, self._holds.check, context=self.context)
+            group = _adapter(_MOVE_GROUP).MoveGroupNode(
+                self.service, config.move_group, config.controller, self._holds.check, context=self.context
+            )
             group.on_scene = self._show_scene
             self.companions = (group,)
         if config.servo.enabled:
-            kind = importlib.import_module(_SERVO).ServoNode
-            servo = kind(self.service, config.servo, config.controller, self._holds.check, context=self.context)
+            servo = _adapter(_SERVO).ServoNode(
+                self.service, config.servo, config.controller, self._holds.check, context=self.context
+            )
             self.companions = (*self.companions, servo)
         for arm in arms.values():
             self.get_logger().info(f"{arm.name} arm: {', '.join(arm.names)}; inverse kinematics: {arm.inverse.method}")

@@ -48,7 +48,7 @@ LOST = {Code.ROBOT_LOST, Code.STALE_DATA, Code.EXECUTION_FAILED, Code.GRASP_LOST
 @pytest.fixture(scope="module")
 def up(start_graph: Any) -> Any:
     """The graph `sim`, whose true camera mounts only the calibration knows, ready; recordings with few pictures."""
-    graph = start_graph("sim", "--set", "flight_recorder.image_rate=1.0")
+    graph = start_graph("sim", "--moveit", "--set", "flight_recorder.image_rate=1.0")
     graph.wait_ready()
     return graph
 

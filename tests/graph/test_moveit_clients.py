@@ -30,7 +30,7 @@ _NAMES = {
 
 @pytest.mark.parametrize("robot", _NAMES)
 def test_every_program_of_the_library_does_what_it_should(start_graph: Any, robot: str) -> None:
-    up = start_graph("motion", "--robot", robot)
+    up = start_graph("motion", "--moveit", "--robot", robot)
     up.wait_ready()
     command = [sys.executable, str(ROOT / "examples" / "moveit_programs.py"), "--json", *_NAMES[robot]]
 
@@ -48,7 +48,7 @@ def test_every_program_of_the_library_does_what_it_should(start_graph: Any, robo
 
 @pytest.mark.requirement("B-47", "B-50")
 def test_the_state_machine_of_the_example_places_the_cube_by_ground_truth(start_graph: Any) -> None:
-    up = start_graph("sim")
+    up = start_graph("sim", "--moveit")
     up.wait_ready()
     place = (0.36, -0.20)
     command = [sys.executable, str(ROOT / "examples" / "moveit_client.py"), "red", "--place", *map(str, place)]

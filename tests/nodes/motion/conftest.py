@@ -15,6 +15,7 @@ from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.action.client import ClientGoalHandle
 from rclpy.duration import Duration
+from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
@@ -250,3 +251,11 @@ def make_bench(ros, description: RobotDescription) -> Callable[..., Bench]:
 @pytest.fixture
 def bench(make_bench) -> Bench:
     return make_bench()
+
+
+@pytest.fixture
+def moveit_bench(make_bench) -> Bench:
+    """With the nodes that answer clients of MoveIt."""
+    return make_bench(
+        parameter_overrides=[Parameter(f"{node}.enabled", value=True) for node in ("move_group", "servo")]
+    )

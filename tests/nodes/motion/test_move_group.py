@@ -114,6 +114,11 @@ class Client:
 
 
 @pytest.fixture
+def bench(moveit_bench):
+    return moveit_bench
+
+
+@pytest.fixture
 def client(bench) -> Client:
     return Client(bench)
 

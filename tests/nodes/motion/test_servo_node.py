@@ -61,6 +61,11 @@ def twist(frame: str = "", z: float = 0.1) -> TwistStamped:
 
 
 @pytest.fixture
+def bench(moveit_bench):
+    return moveit_bench
+
+
+@pytest.fixture
 def client(bench) -> Client:
     return Client(bench)
 
