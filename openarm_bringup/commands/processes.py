@@ -12,13 +12,14 @@ from cyclopts import Parameter
 
 from openarm_bringup.outcome import Outcome, show
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import printable
 
 if TYPE_CHECKING:
     import psutil
 
 
 def ps(*, seconds: float = 0.3) -> Outcome:
-    """List the running graphs and their nodes, with the CPU and memory of each (and of what it has started).
+    """List the running graphs: CPU and memory of each node (and of what it has started), and what it says is wrong.
 
     Args:
         seconds: How long the CPU is measured.
@@ -49,6 +50,8 @@ def ps(*, seconds: float = 0.3) -> Outcome:
                 f"  {name:<24}{node['state']:<10}{node['pid'] or '-':>8}{node['cpu_percent']:>8.1f}"
                 f"{node['rss_mib']:>8.0f}{node['restarts']:>10}"
             )
+            if node["trouble"]:
+                lines.append(f"    {printable(node['trouble'])}")
     return Outcome(True, data={"graphs": graphs}, text="\n".join(lines))
 
 

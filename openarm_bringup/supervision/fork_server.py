@@ -19,9 +19,11 @@ import os
 import signal
 import socket
 import sys
-import traceback
 from contextlib import suppress
-from typing import Any, NoReturn
+from functools import partial
+from typing import Any
+
+from openarm_common.forked import run_and_exit
 
 #: Longest request, bytes; most of one is the environment.
 LONGEST = 2**20
@@ -45,7 +47,7 @@ def main() -> None:
             channel.close()
             gc.enable()
             _become(node, files[0])
-            _run(node["module"])
+            run_and_exit(partial(_run, node["module"]))
         os.close(files[0])
 
 
@@ -93,21 +95,8 @@ def _become(node: dict[str, Any], output: int) -> None:
     ctypes.CDLL(None).prctl(_PR_SET_NAME, node["name"].encode()[:15], 0, 0, 0)
 
 
-def _run(module: str) -> NoReturn:
-    """Run a node, and end without destructors of libraries: some wait for threads of the process before the fork."""
-    code = 0
-    try:
-        importlib.import_module(module).main()
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else int(end.code is not None)
-        if isinstance(end.code, str):
-            sys.stderr.write(f"{end.code}\n")
-    except BaseException:
-        traceback.print_exc()
-        code = 1
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+def _run(module: str) -> None:
+    importlib.import_module(module).main()
 
 
 if __name__ == "__main__":

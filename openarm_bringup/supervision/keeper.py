@@ -46,6 +46,10 @@ class Probe(Protocol):
         """Return for how long a node whose process lives has shown no sign of life, s."""
         ...
 
+    def trouble(self, node: str) -> str:
+        """Return what a node says on /diagnostics if it is a warning or an error; else empty."""
+        ...
+
     def emergency_stop(self, seconds: float) -> str:
         """Let the joints hold; return the answer of who commands them, or why there is none within so long."""
         ...
@@ -77,6 +81,8 @@ class Keeper:
         self.process: NodeProcess | None = None
         self.restarts = 0
         self.ready = asyncio.Event()
+        #: What it says on /diagnostics, if that is a warning or an error.
+        self.trouble = ""
         self.log = supervisor.log_file(name)
         #: Names in /dev/shm that its processes have used.
         self.mapped: set[str] = set()
@@ -206,11 +212,15 @@ class Keeper:
             await self._check_parameters()
 
     async def _until_it_hangs(self, process: NodeProcess) -> str:
-        """Wait until a process runs and its middleware shows no sign of life; return what to say of it."""
+        """Wait until a process runs and shows no sign of life, and note its troubles; return what to say of it."""
         since, silence = time.monotonic(), 0.0
         while min(silence, time.monotonic() - since) < _HANGS_S:
             await asyncio.sleep(_LOOK_S)
             silence = await self._supervisor.ask(lambda probe: probe.silence(self.name))
+            trouble = await self._supervisor.ask(lambda probe: probe.trouble(self.name))
+            if trouble != self.trouble:
+                self.trouble = trouble
+                self._supervisor.record()
             if process.stopped:
                 since = time.monotonic()
         return f"hung: no sign of life for {silence:.0f} s"
@@ -232,5 +242,5 @@ class Keeper:
         return OpenArmError(Code.NOT_READY, f"{self.name} {why}; its log {self.log.path} ends with:\n{tail}")
 
     def _enter(self, state: NodeState, detail: str) -> None:
-        self.state = state
+        self.state, self.trouble = state, ""
         self._supervisor.changed(self.name, state, detail)

@@ -36,6 +36,8 @@ class NodeRecord(Config):
     pid: int | None = None
     restarts: int = 0
     log: str = ""
+    #: What it says on /diagnostics, if that is a warning or an error.
+    trouble: str = ""
 
 
 class RunRecord(Config):

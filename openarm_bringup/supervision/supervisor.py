@@ -122,7 +122,7 @@ class Supervisor:
             watcher.add_done_callback(lambda task, keeper=keeper: self._watcher_ended(keeper, task))
             self._watchers.append(watcher)
         self.daemon.open()
-        self._record()
+        self.record()
 
     async def wait_ready(self) -> float:
         """Wait until every node is ready; return how long that took since the supervisor was made, s.
@@ -137,7 +137,7 @@ class Supervisor:
                 raise OpenArmError(Code.CANCELLED, "asked to stop before the graph was ready")
         finally:
             ready.cancel()
-        self._record()
+        self.record()
         return time.monotonic() - self._began
 
     async def wait_stop_asked(self, *others: asyncio.Task[None]) -> None:
@@ -282,7 +282,7 @@ class Supervisor:
     def changed(self, node: str, state: NodeState, detail: str) -> None:
         """Log, record and publish a change of a node."""
         self.say(f"{node}: {state}: {detail}")
-        self._record()
+        self.record()
         self._publish(node, state, detail)
 
     def say(self, text: str) -> None:
@@ -312,11 +312,16 @@ class Supervisor:
         if self._listener is not None:
             self._listener(Event(time.monotonic() - self._began, node, state, detail))
 
-    def _record(self) -> None:
+    def record(self) -> None:
+        """Write what `openarm ps` shows."""
         me = psutil.Process()
         nodes = {
             name: runs.NodeRecord(
-                state=keeper.state, pid=keeper.pid, restarts=keeper.restarts, log=str(keeper.log.path)
+                state=keeper.state,
+                pid=keeper.pid,
+                restarts=keeper.restarts,
+                log=str(keeper.log.path),
+                trouble=keeper.trouble,
             )
             for name, keeper in self._keepers.items()
         }

@@ -16,11 +16,11 @@ import subprocess
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Mapping
 
 from openarm_common import ports
 from openarm_common.camera.cameras import CameraConfig
+from openarm_common.forked import run_and_exit
 from openarm_common.pacing import AdaptiveShare, RateDivider
 from openarm_sim_bridge.cameras.handover import CameraReport, CameraSetup, StateSender, pair
 from openarm_sim_bridge.faults.faults import Fault
@@ -47,15 +47,13 @@ class SpareProcess:
         self.pid = os.fork()
         if self.pid == 0:
             self.ours.close()
-            code = 1
-            try:
-                serve(theirs)
-                code = 0
-            except BaseException:
-                traceback.print_exc()
-            finally:
-                os._exit(code)  # without destructors of libraries, some of which wait for threads of the other process
+            run_and_exit(lambda: serve(theirs))
         theirs.close()
+
+    def release(self) -> None:
+        """End it: nothing is to be drawn."""
+        self.ours.close()
+        self.wait()
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait for its end, s; return its exit code, as `subprocess.Popen.wait`."""

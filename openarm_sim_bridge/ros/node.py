@@ -92,6 +92,8 @@ class MujocoBridge(ControlNode[BridgeConfig]):
             robot=self._face.speaks,
         )
         self._images = self._camera_feed(cameras, world.snapshot(), spare) if config.images else None
+        if self._images is None and spare is not None:
+            spare.release()
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
         self._face.serve(self._simulation)
@@ -223,11 +225,7 @@ def make(spare: SpareProcess | None = None) -> MujocoBridge:
 
 def main() -> None:
     """Run the node."""
-    spare = SpareProcess(serve)
-    try:
-        run(partial(make, spare))
-    finally:
-        spare.ours.close()  # where there were no cameras, it ends now
+    run(partial(make, SpareProcess(serve)))
 
 
 if __name__ == "__main__":

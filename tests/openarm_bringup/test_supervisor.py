@@ -22,6 +22,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from openarm_bringup.commands.processes import ps
 from openarm_bringup.supervision import environment, guard, keeper, runs
 from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready, Restart
 from openarm_bringup.supervision.keeper import NodeState
@@ -60,6 +61,9 @@ class FileProbe:
     def silence(self, node: str) -> float:
         self.asked += 1
         return self.silent_s
+
+    def trouble(self, node: str) -> str:
+        return f"{node} is hot" if (self.folder / "hot").exists() else ""
 
     def emergency_stop(self, seconds: float) -> str:
         (self.folder / "held").touch()
@@ -246,6 +250,21 @@ time.sleep(60)
             one.bind(("", first))  # released at the end
 
     asyncio.run(body())
+
+
+@in_loop
+async def test_what_a_node_says_is_wrong_is_shown_until_it_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keeper, "_LOOK_S", 0.01)
+    async with running(tmp_path, {"motor": toy(tmp_path, "motor")}, probe=FileProbe(tmp_path)) as run:
+        await run.supervisor.wait_ready()
+        (tmp_path / "hot").touch()
+        await run.until(lambda: runs.running()[0].nodes["motor"].trouble == "motor is hot")
+        assert "    motor is hot" in ps(seconds=0.0).text.splitlines()
+        (tmp_path / "hot").unlink()
+        await run.until(lambda: runs.running()[0].nodes["motor"].trouble == "")
+        assert "hot" not in ps(seconds=0.0).text
 
 
 @pytest.mark.long

@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.srv import ListParameters
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
@@ -21,6 +22,8 @@ from openarm_bringup.supervision.graph import Ready
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import Watch
 from openarm_common.ros.client import ContextNode
+from openarm_common.ros.node import reliable
+from openarm_common.ros.polled import Polled, Source
 
 #: Time that a service gets to answer before it is asked again, s.
 _ASK_AGAIN_S = 2.0
@@ -39,6 +42,8 @@ class ReadinessClient(ContextNode):
         self._waiting: dict[str, Subscription] = {}
         self._received: set[str] = set()
         self._watches: dict[str, Watch] = {}
+        self._diagnostics = Polled(self._node, Source(DiagnosticArray, "/diagnostics", reliable(100)))
+        self._troubles: dict[str, str] = {}
         self._stop = self._node.create_client(Trigger, "/stop")
 
     def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
@@ -58,6 +63,14 @@ class ReadinessClient(ContextNode):
         if node not in self._watches:
             self._watches[node] = Watch(self._node, "", node, f"/{node}")
         return self._watches[node].silence
+
+    def trouble(self, node: str) -> str:
+        """Return what a node last said on /diagnostics if it was a warning or an error; else empty."""
+        for message in self._diagnostics.take():
+            for status in message.status:
+                bad = status.level not in (DiagnosticStatus.OK, DiagnosticStatus.STALE)
+                self._troubles[status.name.partition(":")[0]] = status.message if bad else ""
+        return self._troubles.get(node, "")
 
     def parameters(self, node: str, timeout_s: float = 20.0) -> frozenset[str]:
         """Return the names of a node's parameters.
