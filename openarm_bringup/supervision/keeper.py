@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 #: A node without a sign of life for so long hangs, s; asked for with this period, s.
 _HANGS_S, _LOOK_S = 10.0, 2.0
-#: A node that was ready for so many times the pause before its start is started again without a longer one.
-_WORKED = 10.0
 #: Period in which is noted what a node uses that is not ready yet, s.
 _NOTE_S = 1.0
 
@@ -118,7 +116,7 @@ class Keeper:
                 return
             if ready_s > policy.forget_after:
                 self.restarts = 0
-            if ready_s > _WORKED * pause:
+            if ready_s > 0.0:
                 pause = policy.backoff
             # A node that was never ready fails for a reason that a second try will not remove.
             if policy.policy == "never" or not self._was_ready:
