@@ -2,8 +2,8 @@
 """Starts the nodes of a graph in the order of their needs, watches them, and stops every one of them.
 
 All of it runs in one asyncio loop; the ROS graph is asked through a `Probe` in a thread. A node that fails is started
-again, with growing pauses while it does not get ready. Stopping goes from the last dependents to the first needs; nothing survives it. Should the
-supervisor itself be killed, a guard process ends the nodes.
+again, with growing pauses while it does not get ready. Stopping goes from the last dependents to the first needs;
+nothing survives it. Should the supervisor itself be killed, a guard process ends the nodes.
 """
 
 from __future__ import annotations
