@@ -30,7 +30,7 @@ def bare_kernel(function: F) -> F:
 class _Inner(CPUDispatcher):
     """A function that Python can't call: it would have no entry for it."""
 
-    def __call__(self, *_: Any) -> Any:
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
         raise TypeError(f"{self.__name__} is called by kernels only")
 
 

@@ -51,7 +51,7 @@ def ps(*, seconds: float = 0.3) -> Outcome:
                 f"{node['rss_mib']:>8.0f}{node['restarts']:>10}"
             )
             if node["trouble"]:
-                lines.append(f"    {printable(node['trouble'])}")
+                lines.append(f"    {printable(str(node['trouble']))}")
     return Outcome(True, data={"graphs": graphs}, text="\n".join(lines))
 
 
