@@ -49,8 +49,9 @@ macro(interface_package)
   endforeach()
 
   if(SKBUILD)
-    # Python over rmw_fastrtps needs the C side only: leave out what C++ nodes and other middlewares use.
-    list(FILTER AMENT_EXTENSIONS_rosidl_generate_idl_interfaces EXCLUDE REGEX "_cpp:|rosidl_typesupport_introspection_c:")
+    # Python over rmw_fastrtps needs the C side only: leave out what only C++ nodes use (half of the build time). The
+    # introspection type support stays: the middleware describes types by it.
+    list(FILTER AMENT_EXTENSIONS_rosidl_generate_idl_interfaces EXCLUDE REGEX "_cpp:")
     set(CMAKE_C_FLAGS_RELEASE -O1)
     set(CMAKE_CXX_FLAGS_RELEASE -O1)
   endif()
@@ -61,7 +62,7 @@ macro(interface_package)
   if(SKBUILD)
     # Headers (Fast CDR, Python, NumPy) take longer to compile than what is generated: one translation unit a library.
     # Descriptions of types stay apart, because their static names repeat.
-    foreach(library generator_c generator_py typesupport_c typesupport_fastrtps_c)
+    foreach(library generator_c generator_py typesupport_c typesupport_fastrtps_c typesupport_introspection_c)
       set_target_properties(${PROJECT_NAME}__rosidl_${library} PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 0)
     endforeach()
     get_target_property(sources ${PROJECT_NAME}__rosidl_generator_c SOURCES)
