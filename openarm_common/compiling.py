@@ -15,24 +15,29 @@ _COMPILE = "numba:compile"
 class _Listener(event.Listener):
     """Says once for each package that its kernels are being compiled."""
 
-    def __init__(self, say: Callable[[str], object]) -> None:
-        self._say = say
+    def __init__(self) -> None:
+        self.say: Callable[[str], object] | None = None
         self._said = set[str]()
 
     def on_start(self, event: Any) -> None:
         package = str(event.data["dispatcher"].py_func.__module__).rpartition(".")[0]
-        if package.startswith("openarm_") and package not in self._said:
+        if self.say is not None and package.startswith("openarm_") and package not in self._said:
             self._said.add(package)
-            self._say(f"compiling kernels of {package}: once, and it takes some seconds")
+            self.say(f"compiling kernels of {package}: once, and it takes some seconds")
 
     def on_end(self, event: Any) -> None:
         pass
 
 
+_LISTENER = _Listener()
+
+
 def announce(say: Callable[[str], object]) -> None:
-    """Have it said when kernels are compiled in this process.
+    """Have it said when kernels are compiled in this process; who asked last is told.
 
     Args:
         say: Gets a sentence for each package, in the thread that compiles.
     """
-    event.register(_COMPILE, _Listener(say))
+    if _LISTENER.say is None:
+        event.register(_COMPILE, _LISTENER)
+    _LISTENER.say = say

@@ -66,7 +66,9 @@ def _adapter(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        text = f"there is no Python package {error.name}; ./openarm up --moveit builds it"
+        if error.name != "moveit_msgs":
+            raise
+        text = "there is no Python package moveit_msgs; ./openarm up --moveit builds it"
         raise OpenArmError(Code.ENVIRONMENT, text) from error
 
 
