@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m openarm_bringup.warm [first]`: compile the numba kernels once, so that no node waits for them.
+"""`python -m openarm_bringup.warm [nodes]`: compile the numba kernels once, so that no node waits for them.
 
-`first`: those that the first pick of an object of known shape needs. The others are compiled when they are first used,
-which the log of the node says.
+`nodes`: those that nodes run in their executor, which must not halt for seconds. Those of calibration run in a worker
+thread: left out, they are compiled when they are first used, which the log of the node says.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ def warm_hardware() -> None:
     SelfCollision(description, [name for arm in description.arms.values() for name in arm.controlled])
 
 
-#: What the first pick needs, and the rest; the dearest first.
-FIRST = (motion.warm_collision, octomap.warm, motion.warm_kinematics)
-REST = (calibration.warm, octomap.warm_rest, grasp.warm, perception.warm, warm_hardware)
+#: What nodes run in their executor, and the rest; the dearest first.
+OF_NODES = (octomap.warm, motion.warm_collision, grasp.warm, motion.warm_kinematics, perception.warm, warm_hardware)
+REST = (calibration.warm,)
 
 
 def main() -> None:
     """Warm packages that have kernels, in as many processes as there are processors."""
-    parts = FIRST if sys.argv[1:] == ["first"] else (*FIRST, *REST)
+    parts = OF_NODES if sys.argv[1:] == ["nodes"] else (*OF_NODES, *REST)
     # The collector would look at the many objects of numba again and again.
     with ProcessPoolExecutor(
         len(os.sched_getaffinity(0)), mp_context=get_context("spawn"), initializer=gc.disable

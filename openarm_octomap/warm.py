@@ -24,12 +24,7 @@ _T_BASE_CAMERA = se3.make(None, (0.15, 0.15, 0.0))
 
 
 def warm() -> None:
-    """Run what a map of depth images in millimetres needs once; the compiled code is cached next to the sources."""
-    _map(_grid(), _robot(), _MILLIMETRES)
-
-
-def warm_rest() -> None:
-    """Run the other kernels once: images in metres, clouds, maps of others, cells of two bytes."""
+    """Run each kernel once with the types that the package uses; the compiled code is cached next to the sources."""
     grid, robot = _grid(), _robot()
     index = np.argwhere(np.ones((8, 8, 8), bool))[:300] + grid.lattice.key_min
     leaves = np.column_stack([np.zeros(len(index)), index]).astype(np.int32)
@@ -76,4 +71,3 @@ def _map(grid: OccupancyGrid, robot: tuple[SelfFilter, Shapes], depth: NDArray[A
 
 if __name__ == "__main__":
     warm()
-    warm_rest()

@@ -81,7 +81,7 @@ def test_set_up_compiles_kernels_of_every_package_that_has_some() -> None:
         for path in _ROOT.glob("openarm_*/**/*.py")
         if "openarm_common.kernels" in path.read_text()
     }
-    assert made - {"openarm_common"} <= {part.__module__.partition(".")[0] for part in (*warm.FIRST, *warm.REST)}
+    assert made - {"openarm_common"} <= {part.__module__.partition(".")[0] for part in (*warm.OF_NODES, *warm.REST)}
 
 
 def test_every_interface_package_is_built_by_the_launcher() -> None:
