@@ -23,6 +23,8 @@ from openarm_calibration.board.detection import (
     plane_fit,
     robust_homography,
     smooth_image,
+    unzoomed,
+    zoomed,
 )  # fmt: skip
 from openarm_calibration.board.orientation import fronts, upright
 from openarm_common.errors import Code, OpenArmError
@@ -43,54 +45,97 @@ _UNEVEN = 0.2
 _LEAST_SHARE = 0.7
 #: Blobs lie on the image of a plane to this, px; with more the lens distorts.
 _BENT = 0.4
-_TURN = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-_RIM: Array = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)
+#: Directions about a circle, opposite ones as one, and of each the spread of the rim (2, 2).
+_HALF_TURN = 12
+_ANGLES = (np.arange(_HALF_TURN) + 0.5) * np.pi / _HALF_TURN
+_RIM: Array = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+_SPREAD: Array = _RIM[:, :, None] * _RIM[:, None, :]
+#: Middles of the parts of a pixel, (n, 2) from its own.
+_PARTS: Array = (np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) - 1.5) / 4.0
+#: Most steps to a circle, and the last one, in radii.
+_ROUNDS, _STILL = 8, 1e-3
 
 
-def refined(
-    image: Grey, centres: Array, plane: Array, radius: float, H: Array, shift: Array | None = None
-) -> tuple[Array, NDArray[np.bool_]]:
+def refined(image: Grey, centres: Array, plane: Array, radius: float, H: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the centres of circles (n, 2) by the grey values around them.
 
     Args:
         image: (h, w) grey.
         centres: (n, 2) within 0.4 radii, px.
         plane: (n, 2) circle centres on the board, m.
-        radius: Of the circles, m; nothing but white within 1.85 radii of a centre.
+        radius: Of the circles, m; nothing but white within 1.85 radii of a centre, in half of the directions or more.
         H: (3, 3) homography from the plane to pixels.
-        shift: (n, 2) by which the lens moves each circle off that, px.
 
     Returns:
         The centres, and (n,) which of them are sure: the others are as they were, because something else or the edge
         of the image lies too near.
     """
     out, sure = centres.copy(), np.zeros(len(centres), dtype=bool)
-    back: Array = np.linalg.inv(H).astype(np.float64)
     for k, (centre, at) in enumerate(zip(centres, plane, strict=True)):
-        by = np.zeros(2) if shift is None else shift[k]
-        reach = mapped(H, at + _OUTER * radius * _RIM) + by
-        low, high = np.floor(reach.min(axis=0)).astype(int), np.ceil(reach.max(axis=0)).astype(int) + 1
-        if (low < 0).any() or high[0] > image.shape[1] or high[1] > image.shape[0]:
-            continue
-        u, v = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
-        places = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
-        away = np.linalg.norm(mapped(back, places - by) - at, axis=1) / radius
-        grey = image[low[1] : high[1], low[0] : high[0]].ravel().astype(np.float64)
-        offset = places - centre
+        # the board is flat and a circle is small: an ellipse, the image of the unit circle
+        axes = [mapped(H, at + np.array([step, -step])) for step in radius * np.eye(2)]
+        ellipse = np.column_stack([(one - other) / 2.0 for one, other in axes])
+        found = _centre(image, centre, ellipse)
+        if found is not None:
+            out[k], sure[k] = found, True
+    return out, sure
+
+
+def _centre(image: Grey, start: Array, ellipse: Array) -> Array | None:
+    """Return the centre (2,) of a dark ellipse on white, px; None when it is not where it was said to be.
+
+    It is where the darkness balances. Where something other than white is near, the directions of that are left out,
+    and those opposite: what is left balances about the same centre.
+
+    Args:
+        image: (h, w) grey.
+        start: (2,) px.
+        ellipse: (2, 2) that maps the unit circle to it, px.
+    """
+    reach = _OUTER * np.linalg.norm(ellipse, axis=1)
+    low, high = np.floor(start - reach).astype(int), np.ceil(start + reach).astype(int) + 1
+    if (low < 0).any() or high[0] > image.shape[1] or high[1] > image.shape[0]:
+        return None
+    u, v = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+    places = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+    grey = image[low[1] : high[1], low[0] : high[0]].ravel().astype(np.float64)
+    to_circle: Array = np.linalg.inv(ellipse)
+    # white as a plane of grey: light may fall unevenly
+    columns = np.column_stack([np.ones(len(places)), places - start])
+    centre = start
+    for _ in range(_ROUNDS):
+        from_centre = (places - centre) @ to_circle.T
+        away = np.linalg.norm(from_centre, axis=1)
         ring, inside = (away >= _INNER) & (away < _OUTER), away < _INNER
         if np.count_nonzero(ring) < _FEWEST:
-            continue
-        # white as a plane of grey: light may fall unevenly
-        columns = np.column_stack([np.ones(len(offset)), offset])
-        dark = columns @ np.linalg.lstsq(columns[ring], grey[ring], rcond=None)[0] - grey
-        total, contrast = float(dark[inside].sum()), float(dark[away < 0.5].max(initial=0.0))
-        if not total > 0.0 or float(np.abs(dark[ring]).max()) > _UNEVEN * contrast:
-            continue
-        correction = dark[inside] @ offset[inside] / total
-        limit = _FARTHEST * float(np.ptp(reach, axis=0).min()) / (2.0 * _OUTER)
-        if float(np.linalg.norm(correction)) <= limit:
-            out[k], sure[k] = centre + correction, True
-    return out, sure
+            return None
+        white = float(np.median(grey[ring]))
+        contrast = white - float(grey[away < 0.5].min(initial=white))
+        clean = ring & (np.abs(grey - white) <= 2.0 * _UNEVEN * contrast)
+        dark = columns @ np.linalg.lstsq(columns[clean], grey[clean], rcond=None)[0] - grey
+        used = np.ones(_HALF_TURN, dtype=bool)
+        used[_direction(from_centre[ring & (np.abs(dark) > _UNEVEN * contrast)])] = False
+        if not used.all():
+            # of a pixel the part that lies in directions which are used
+            parts = from_centre[inside, None] + _PARTS @ to_circle.T
+            dark[inside] *= used[_direction(parts)].mean(axis=1)
+        total = float(dark[inside].sum())
+        if 2 * np.count_nonzero(used) < _HALF_TURN or not total > 0.0:
+            return None
+        # a shift moves the rim where it is counted: by all of it for a whole circle
+        step = np.linalg.solve(2.0 * _SPREAD[used].mean(axis=0), dark[inside] @ from_centre[inside] / total)
+        centre = centre + ellipse @ step
+        if np.linalg.norm(to_circle @ (centre - start)) > _FARTHEST:
+            return None
+        if float(np.linalg.norm(step)) < _STILL:
+            break
+    return centre
+
+
+def _direction(from_centre: Array) -> NDArray[np.int64]:
+    """Return in which part of half a turn vectors (..., 2) point, opposite ones in the same."""
+    turns = np.arctan2(from_centre[..., 1], from_centre[..., 0]) / np.pi
+    return np.floor((turns + 1.0) * _HALF_TURN).astype(np.int64) % _HALF_TURN
 
 
 def detect_circles(board: Circles, image: Grey) -> BoardDetection:
@@ -100,16 +145,13 @@ def detect_circles(board: Circles, image: Grey) -> BoardDetection:
     layout = cv2.CALIB_CB_ASYMMETRIC_GRID if isinstance(board, CircleGrid) else cv2.CALIB_CB_SYMMETRIC_GRID
     # A far board is searched for in an enlarged image; the contours of small blobs are too coarse otherwise.
     for zoom in (1, 2, 3):
-        large = image if zoom == 1 else cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+        large = zoomed(image, zoom)
         blobs = _blob_detector(large.shape[0] * large.shape[1], len(board.points))
         for flags in (layout, layout | cv2.CALIB_CB_CLUSTERING):
             found, centres = cv2.findCirclesGrid(large, size, flags=flags, blobDetector=blobs)
             if not found:
                 continue  # on failure there may be a part of a grid, which is no use
-            pixels = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
-            # the resized image's pixel k covers (k + 0.5) / zoom - 0.5
-            pixels = (pixels + 0.5) / zoom - 0.5
-            ordered = _ordered(board, pixels)
+            ordered = _ordered(board, unzoomed(centres, zoom))
             if zoom < 3 and _diameter(board, ordered) * zoom < 9.0:
                 break
             return _located(board, image, ordered)
@@ -184,15 +226,14 @@ def _refined(board: Circles, image: Grey, rough: Array, limit: float) -> tuple[N
     """
     plane = board.points[:, :2]
     H = robust_homography(plane, rough)
-    wanted, by = mapped(H, plane), np.zeros_like(plane)
+    wanted = mapped(H, plane)
     apart = np.linalg.norm(rough - wanted, axis=1)
     near = apart <= max(MOST_DISTORTED * pitch(plane, rough), 0.5)
     bent = float(np.median(apart)) > _BENT and np.count_nonzero(near) >= _LEAST_SHARE * len(plane)
     if bent:
         wanted = smooth_image(plane, rough, near)[0]
-        by = wanted - mapped(H, plane)
     astray = np.linalg.norm(rough - wanted, axis=1) > 0.5 + 0.05 * _diameter(board, rough)
-    exact, sure = refined(image, np.where(astray[:, None], wanted, rough), plane, board.radius, H, by)
+    exact, sure = refined(image, np.where(astray[:, None], wanted, rough), plane, board.radius, H)
     if np.count_nonzero(sure) < 4:
         return np.flatnonzero(sure), exact[sure]
     flat = mapped(robust_homography(plane[sure], exact[sure]), plane)

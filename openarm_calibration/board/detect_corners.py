@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
@@ -20,6 +21,8 @@ from openarm_calibration.board.detection import (
     plane_fit,
     robust_homography,
     smooth_image,
+    unzoomed,
+    zoomed,
 )  # fmt: skip
 from openarm_calibration.board.orientation import fronts, upright
 from openarm_calibration.board.saddles import located
@@ -28,33 +31,50 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 
 _FEWEST_CORNERS = 8
+#: In which a chessboard is searched for: the fast finder takes neither very large nor very small squares.
+_ZOOMS = (1.0, 0.5, 2.0)
+#: In which codes are read.
+_NEARER = (1.0, 2.0)
 #: Of the edges of a marker: share that is used, samples along them, and how far to either side, as shares of the edge.
 _EDGE_SHARE, _ALONG, _ASIDE = 0.8, 40, 0.06
 
 
 def detect_chessboard(board: Chessboard, image: Grey) -> BoardDetection:
-    """Find a chessboard, all of it; errors as `detect`."""
-    size = (board.columns, board.rows)
-    found, corners = False, np.empty((0, 2))
-    for flags in (
-        cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY,
-        cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE,
-    ):
+    """Find a chessboard, all of it; errors as `detect`.
+
+    Each finder of OpenCV misses boards that another one sees, or takes a wrong grid for them: one after another is
+    asked, until the corners that it found are judged to be those of the board.
+    """
+    refused = OpenArmError(
+        Code.NOTHING_DETECTED,
+        f"no {board.label}; are all of its {board.columns}x{board.rows} inner corners in the image (counted are"
+        " corners, not squares), with white around the squares, lit and sharp?",
+    )
+    plane = board.points[:, :2]
+    for corners in _grids(board, image):
+        orders = fronts(plane, corners, board.rows, board.columns)
+        dark = [_first_is_dark(image, order, board) for order in orders]
+        orders = [order for order, first in zip(orders, dark, strict=True) if first] or orders
+        pixels = upright(orders, board.rows, board.columns)
+        try:
+            return _judged(board, image, np.arange(len(plane)), located(plane, image, pixels, board.spacing))
+        except OpenArmError as error:
+            refused = error
+    raise refused
+
+
+def _grids(board: Chessboard, image: Grey) -> Iterator[Array]:
+    """Yield the corners (n, 2) of grids that finders take for the board, px; the fast finder first."""
+    size, fast = (board.columns, board.rows), cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    for zoom in _ZOOMS:
+        found, corners = cv2.findChessboardCorners(zoomed(image, zoom), size, flags=fast)
+        if found:
+            yield unzoomed(corners, zoom)
+    thorough = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+    for flags in (thorough, thorough | cv2.CALIB_CB_EXHAUSTIVE):
         found, corners = cv2.findChessboardCornersSB(image, size, flags=flags)
         if found:
-            break
-    if not found:
-        raise OpenArmError(
-            Code.NOTHING_DETECTED,
-            f"no {board.label}; are all of its {board.columns}x{board.rows} inner corners in the image (counted are"
-            " corners, not squares), with white around the squares, lit and sharp?",
-        )
-    plane = board.points[:, :2]
-    orders = fronts(plane, np.asarray(corners, dtype=np.float64).reshape(-1, 2), board.rows, board.columns)
-    dark = [_first_is_dark(image, order, board) for order in orders]
-    orders = [order for order, first in zip(orders, dark, strict=True) if first] or orders
-    pixels = upright(orders, board.rows, board.columns)
-    return _judged(board, image, np.arange(len(plane)), located(plane, image, pixels, board.spacing))
+            yield unzoomed(corners, 1.0)
 
 
 def _first_is_dark(image: Grey, order: Array, board: Chessboard) -> bool:
@@ -69,17 +89,23 @@ def _first_is_dark(image: Grey, order: Array, board: Chessboard) -> bool:
 
 def detect_charuco(board: Charuco, image: Grey) -> BoardDetection:
     """Find the corners of a ChArUco board that are in view; errors as `detect`."""
-    corners, ids, markers, _ = cv2.aruco.CharucoDetector(board.board).detectBoard(image)
-    count = 0 if ids is None else len(ids)  # pyright: ignore[reportUnnecessaryComparison] - None without a board
-    if count < _FEWEST_CORNERS:
+    parameters = cv2.aruco.CharucoParameters()
+    detector = cv2.aruco.CharucoDetector(board.board, parameters, _marker_parameters())
+    index, pixels, markers = np.empty(0, np.int64), np.empty((0, 2)), 0
+    for zoom in _NEARER:
+        corners, ids, quads, _ = detector.detectBoard(zoomed(image, zoom))
+        markers = max(markers, len(quads or ()))
+        if ids is not None and len(ids) > len(index):  # pyright: ignore[reportUnnecessaryComparison]
+            order = np.argsort(ids.ravel())
+            index, pixels = ids.ravel()[order].astype(np.int64), unzoomed(corners, zoom)[order]
+        if len(index) == len(board.points):
+            break
+    if len(index) < _FEWEST_CORNERS:
         raise OpenArmError(
             Code.NOTHING_DETECTED,
-            f"{count} corners and {len(markers or ())} markers of {board.label}, at least {_FEWEST_CORNERS} corners are"
+            f"{len(index)} corners and {markers} markers of {board.label}, at least {_FEWEST_CORNERS} corners are"
             " needed; is the board in the image, sharp, and of this size and dictionary?",
         )
-    order = np.argsort(ids.ravel())
-    index = ids.ravel()[order].astype(np.int64)
-    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)[order]
     # the nearest edge is that of a marker
     reach = 0.5 * (board.spacing - board.diameter)
     return _judged(board, image, index, located(board.points[index, :2], image, pixels, reach))
@@ -87,7 +113,7 @@ def detect_charuco(board: Charuco, image: Grey) -> BoardDetection:
 
 def detect_aprilgrid(board: AprilGrid, image: Grey) -> BoardDetection:
     """Find the tags of an AprilGrid that are in view; errors as `detect`."""
-    found = _markers(board.dictionary, image, board.border_bits)
+    found = _markers(board.dictionary, image, board.border_bits, board.columns * board.rows)
     wanted = {number: quad for number, quad in found.items() if number < board.columns * board.rows}
     if 4 * len(wanted) < _FEWEST_CORNERS:
         raise OpenArmError(
@@ -106,7 +132,7 @@ def detect_aprilgrid(board: AprilGrid, image: Grey) -> BoardDetection:
 
 def detect_marker(board: Marker, image: Grey) -> BoardDetection:
     """Find one marker, by lines along its edges; errors as `detect`."""
-    found = _markers(board.dictionary, image, 1)
+    found = _markers(board.dictionary, image, 1, 1)
     if board.id not in found:
         seen = ", ".join(str(number) for number in sorted(found)[:10]) or "none"
         raise OpenArmError(
@@ -124,19 +150,38 @@ def detect_marker(board: Marker, image: Grey) -> BoardDetection:
     return BoardDetection(np.arange(4), pixels, deviation)
 
 
-def _markers(dictionary: str, image: Grey, border_bits: int) -> dict[int, Array]:
-    """Return the corners (4, 2) of all markers by id; an id that is there twice is left out."""
+def _marker_parameters(border_bits: int = 1) -> cv2.aruco.DetectorParameters:
+    """Return the parameters with which markers are found as small as they can be read."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.minMarkerPerimeterRate = 0.01
+    return parameters
+
+
+def _markers(dictionary: str, image: Grey, border_bits: int, wanted: int) -> dict[int, Array]:
+    """Return the corners (4, 2) of all markers by id; an id that is there twice is left out.
+
+    Args:
+        dictionary: Of the codes.
+        image: (h, w) grey.
+        border_bits: Modules of black around the code.
+        wanted: Markers; where fewer are found, the image is enlarged.
+    """
     codes = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    quads, ids, _ = cv2.aruco.ArucoDetector(codes, parameters).detectMarkers(image)
-    if ids is None:  # pyright: ignore[reportUnnecessaryComparison] - None without a marker
-        return {}
-    numbers = [int(number) for number in np.ravel(ids)]
-    pairs = zip(numbers, quads, strict=True)
-    return {n: np.asarray(quad, dtype=np.float64).reshape(4, 2) for n, quad in pairs if numbers.count(n) == 1}
+    detector = cv2.aruco.ArucoDetector(codes, _marker_parameters(border_bits))
+    best: dict[int, Array] = {}
+    for zoom in _NEARER:
+        quads, ids, _ = detector.detectMarkers(zoomed(image, zoom))
+        if ids is None:  # pyright: ignore[reportUnnecessaryComparison] - None without a marker
+            continue
+        numbers = [int(number) for number in np.ravel(ids)]
+        pairs = zip(numbers, quads, strict=True)
+        found = {n: unzoomed(quad, zoom) for n, quad in pairs if numbers.count(n) == 1}
+        best = max(best, found, key=len)
+        if len(best) >= wanted:
+            break
+    return best
 
 
 def _judged(board: Any, image: Grey, ids: NDArray[np.int64], pixels: Array) -> BoardDetection:
@@ -192,7 +237,8 @@ def _quad_by_edges(image: Grey, rough: Array) -> tuple[Array, float]:
                 grey, places[..., 0].astype(np.float32), places[..., 1].astype(np.float32), cv2.INTER_LINEAR,
                 borderMode=cv2.BORDER_REPLICATE,
             )  # fmt: skip
-            slope = np.abs(np.gradient(profile, axis=1)).astype(np.float64)
+            # corners come clockwise, so that the inside is dark ahead; what is beyond the paper may be dark, too
+            slope = np.maximum(-np.gradient(profile, axis=1), 0.0).astype(np.float64)
             slope = np.maximum(slope - 0.2 * slope.max(axis=1, keepdims=True), 0.0)
             weight = slope.sum(axis=1)
             good = weight > 0.3 * float(np.median(weight))

@@ -9,6 +9,7 @@ and size of the board in this picture make of a mark that was found well.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -98,6 +99,19 @@ def examine(image: Grey, plane: Array, pixels: Array) -> Quality:
     contrast = float(light - dark)
     blur = contrast / (np.sqrt(2.0 * np.pi) * max(steepest, 0.02 * contrast, 1e-3))
     return Quality(noise, contrast, blur, pitch(plane, pixels))
+
+
+def zoomed(image: Grey, zoom: float) -> Grey:
+    """Return an image with `zoom` times as many pixels a side."""
+    if zoom == 1.0:
+        return image
+    way = cv2.INTER_CUBIC if zoom > 1.0 else cv2.INTER_AREA
+    return cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=way).astype(np.uint8)
+
+
+def unzoomed(pixels: Any, zoom: float) -> Array:
+    """Return pixels (n, 2) of a `zoomed` image as those of the image: pixel centres are whole numbers in both."""
+    return (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) + 0.5) / zoom - 0.5
 
 
 def pitch(plane: Array, pixels: Array) -> float:

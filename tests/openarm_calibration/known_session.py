@@ -37,24 +37,33 @@ def _drawn(board: Board, scale: float) -> Array:
     return board.draw(scale)
 
 
-def photograph(board: Board, T_camera_board: Array, optics: Intrinsics) -> Array:
+def photograph(board: Board, T_camera_board: Array, optics: Intrinsics, end: Array | None = None) -> Array:
     """Return the grey picture (h, w) of a board alone, 16 samples a pixel; 0 to 255.
 
     Args:
         board: The board.
         T_camera_board: (4, 4).
         optics: Of the camera.
+        end: (2,) where the paper ends, m from its middle, before something dark; one sample a pixel then.
     """
-    scale, zoom = 4000.0, 4
+    scale, zoom = 4000.0, 4 if end is None else 1
     w, h = board.size
+    drawn = _drawn(board, scale)
+    if end is not None:
+        far_u, far_v = (np.abs(np.arange(n) / scale - edge / 2) > at for n, edge, at in zip(
+            drawn.shape[::-1], (w, h), end, strict=True))  # fmt: skip
+        drawn = np.where(far_v[:, None] | far_u, 56, drawn).astype(np.uint8)
     to_board = np.array([[1 / scale, 0, 0.5 / scale - w / 2], [0, 1 / scale, 0.5 / scale - h / 2], [0, 0, 1]])
     K = optics.matrix
     K[:2] *= zoom
     K[:2, 2] += (zoom - 1) / 2
     H = K @ T_camera_board[:3, [0, 1, 3]] @ to_board
+    around, way = (130.0, cv2.INTER_LINEAR) if end is None else (56.0, cv2.INTER_NEAREST)
     large = cv2.warpPerspective(
-        _drawn(board, scale), H, (optics.width * zoom, optics.height * zoom), borderValue=(130.0,)
-    )
+        drawn, H, (optics.width * zoom, optics.height * zoom), flags=way, borderValue=(around,)
+    )  # fmt: skip
+    if end is not None:
+        return large
     return cv2.resize(large, (optics.width, optics.height), interpolation=cv2.INTER_AREA).astype(np.float64)
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_calibration.board.board import SPELLINGS, Board, read_board
+from openarm_calibration.board.circles import CircleGrid, SymmetricCircles
 from openarm_calibration.board.detect import detect
 from openarm_calibration.board.detection import consistent, smooth_image
 from openarm_calibration.board.squares import Charuco
@@ -233,3 +234,28 @@ def test_boards_that_are_none_are_refused_with_what_is_valid(text: str, words: s
 def test_target_files_of_kalibr_are_read() -> None:
     text = "{target_type: aprilgrid, tagCols: 5, tagRows: 4, tagSize: 0.03, tagSpacing: 0.3}"
     assert read_board(text) == read_board("aprilgrid:5x4:30mm:0.3")
+
+
+@pytest.mark.parametrize(
+    "board",
+    [read_board("chessboard:4x3:50mm"), *(BOARDS[k] for k in (0, 3, 5, 6)), read_board("circles:4x11:20mm:15mm")],
+    ids=lambda b: b.kind,
+)
+@pytest.mark.requirement("A-42")
+def test_a_far_board_of_which_the_paper_ends_close_by_is_found_in_a_large_picture(board: Board) -> None:
+    """Of 15 to 60 px a square, without softened edges, before something dark; always the same answer."""
+    optics, rng = Intrinsics(1920, 1080, 1371.0, 1371.0, 959.5, 539.5), np.random.default_rng(3)
+    if isinstance(board, CircleGrid | SymmetricCircles):
+        end = np.abs(board.points[:, :2]).max(axis=0) + 0.7 * board.diameter
+    else:
+        end = np.array(board.pattern) / 2.0 + 0.2 * board.feature
+    for k in range(4):
+        turn = se3.exp_so3((*rng.uniform(-0.45, 0.45, 2), 0.0)) @ se3.rot_z(rng.uniform(-0.7, 0.7))
+        T = se3.make(turn, (rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.2), 0.8 + 0.35 * k))
+        image = known_session.photograph(board, T, optics, end)
+        true = project(board.points, board.radius, T, np.array([1371.0, 1371.0, 959.5, 539.5]))
+        detection = detect(board, image)
+        away = detection.pixels - true[detection.ids]
+        assert len(detection.ids) >= 0.9 * len(true), k
+        assert np.sqrt(np.mean(away**2)) < 0.25, k
+        assert np.array_equal(detect(board, image).pixels, detection.pixels)

@@ -81,11 +81,23 @@ def test_marks_that_something_covers_or_comes_near_to_are_left_out() -> None:
     assert np.abs(detection.pixels - TRUE[detection.ids]).max() < 0.05
 
 
+@pytest.mark.parametrize("margin", [1.4, 1.6])
+def test_circles_at_the_edge_of_the_paper_are_found_by_their_other_sides(margin: float) -> None:
+    """Of the white around a circle, radii from its centre to a dark table; only corners may be left out."""
+    image = picture(0.5, 0.0, noise=1.0)
+    places = np.stack(np.meshgrid(np.arange(320), np.arange(240)), axis=-1)
+    on_board = (places - H[:2, 2]) @ np.linalg.inv(H[:2, :2]).T
+    image[(np.abs(on_board) > np.abs(PLANE).max(axis=0) + margin * BOARD.radius).any(axis=-1)] = 50
+    detection = detect(BOARD, image)
+    assert len(detection.ids) >= 40
+    assert np.abs(detection.pixels - TRUE[detection.ids]).max() < 0.06
+
+
 def test_a_board_behind_something_is_refused_with_the_number_of_whole_circles() -> None:
-    """Lines between the circles: blobs are found, but their surroundings are not white."""
+    """A frame around each circle: blobs are found, but their surroundings are not white."""
     image = picture(0.0, 0.0)
     for centre in TRUE[:20]:
         u, v = np.round(centre).astype(int)
-        image[v - 3 : v + 4, u + 8] = 60
+        cv2.rectangle(image, (u - 8, v - 8), (u + 8, v + 8), 60)
     with pytest.raises(OpenArmError, match=r"only 2\d of 44 circles .* are whole, with white around them"):
         detect(BOARD, image)
