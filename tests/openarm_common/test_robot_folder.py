@@ -23,6 +23,7 @@ from openarm_motion.config import MotionConfig
 from openarm_motion.planning.moves import RequestBoxes, to_joints
 from openarm_motion.service.motion_service import make_arms
 from openarm_sim_bridge.drafting.check import folder_faults
+from tests.refusals import refuses
 
 
 @pytest.fixture
@@ -40,17 +41,15 @@ def altered(mine: Path, **changes: object) -> None:
 
 
 def test_a_robot_that_is_not_there_is_refused_with_those_that_are(robots):
-    with pytest.raises(OpenArmError, match="no robot 'other'; robots: mine") as error:
+    with refuses(Code.INVALID_ARGUMENT, "no robot 'other'; robots: mine"):
         RobotDescription.from_folder("other")
-    assert error.value.code is Code.INVALID_ARGUMENT
 
 
 def test_all_names_that_the_description_lacks_are_said_at_once(robots):
     text = (robots / "robot.yaml").read_text().replace("openarm_left_joint7", "joint_x")
     (robots / "robot.yaml").write_text(text.replace("openarm_right_hand_tcp", "tip"))
-    with pytest.raises(OpenArmError, match=r"arms\.left: no joint 'joint_x'.*arms\.right: no link 'tip'") as error:
+    with refuses(Code.CONFIG_INVALID, r"arms\.left: no joint 'joint_x'.*arms\.right: no link 'tip'"):
         RobotDescription.from_folder("mine")
-    assert error.value.code is Code.CONFIG_INVALID
 
 
 def test_signs_of_the_mirror_are_as_many_as_joints(robots):
@@ -106,9 +105,8 @@ def test_a_scene_in_the_folder_of_the_robot_goes_before_one_of_all_robots(nearer
 def test_a_robot_that_does_not_say_where_it_works_has_no_scenes(robots, monkeypatch):
     monkeypatch.setenv(folder.ROBOT, "mine")
     altered(robots, work=None)
-    with pytest.raises(OpenArmError, match=r"robot\.yaml:work: missing") as error:
+    with refuses(Code.CONFIG_INVALID, r"robot\.yaml:work: missing"):
         Scene()
-    assert error.value.code is Code.CONFIG_INVALID
 
 
 def test_a_table_that_stands_in_the_robot_is_refused(robots):

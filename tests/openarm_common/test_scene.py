@@ -26,6 +26,7 @@ from openarm_common.scene.scene import (
     parse_scene,
     random_scene,
 )
+from tests.refusals import refuses
 
 
 def cube(name: str = "red_cube", **changes: Any) -> dict[str, Any]:
@@ -33,9 +34,8 @@ def cube(name: str = "red_cube", **changes: Any) -> dict[str, Any]:
 
 
 def refused(data: dict[str, Any]) -> str:
-    with pytest.raises(OpenArmError) as caught:
+    with refuses(Code.SCENE_INVALID) as caught:
         parse_scene(data, "here.yaml")
-    assert caught.value.code is Code.SCENE_INVALID
     assert caught.value.message.startswith("here.yaml")
     return caught.value.message
 
@@ -101,9 +101,8 @@ def test_mass_follows_from_the_volume_where_none_is_given() -> None:
     ],
 )
 def test_an_object_that_does_not_fit_is_refused_with_where(changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(OpenArmError, match=words) as caught:
+    with refuses(Code.SCENE_INVALID, words):
         parse_scene({"objects": [cube(**changes)]}, "here.yaml")
-    assert caught.value.code is Code.SCENE_INVALID
 
 
 def test_an_object_at_the_very_edge_of_the_table_is_accepted() -> None:
@@ -170,17 +169,14 @@ def test_one_object_can_be_checked_for_a_table() -> None:
 
 
 def test_unknown_scenes_and_objects_list_what_there_is(tmp_path: Path) -> None:
-    with pytest.raises(OpenArmError, match=r"no scene 'nowhere'; scenes: .*demo, empty.*random") as caught:
+    with refuses(Code.SCENE_INVALID, r"no scene 'nowhere'; scenes: .*demo, empty.*random"):
         load_scene("nowhere")
-    assert caught.value.code is Code.SCENE_INVALID
     broken = tmp_path / "broken.yaml"
     broken.write_text("objects: [", encoding="utf-8")
-    with pytest.raises(OpenArmError, match=r"broken.yaml is not valid YAML") as caught:
+    with refuses(Code.SCENE_INVALID, r"broken.yaml is not valid YAML"):
         load_scene(broken)
-    assert caught.value.code is Code.SCENE_INVALID
-    with pytest.raises(OpenArmError, match=r"no object 'cup'.*red_cube, green_cylinder, blue_can") as caught:
+    with refuses(Code.INVALID_ARGUMENT, r"no object 'cup'.*red_cube, green_cylinder, blue_can"):
         load_scene("demo").object("cup")
-    assert caught.value.code is Code.INVALID_ARGUMENT
 
 
 def test_scenes_are_frozen() -> None:

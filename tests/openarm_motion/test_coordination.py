@@ -15,6 +15,7 @@ from openarm_motion.planning.coordination import ActiveMotion, least_delay
 from openarm_motion.planning.dual_arm import DualArm
 from openarm_motion.planning.moves import RequestBoxes
 from openarm_motion.timing.trajectory import Motion, Trajectory
+from tests.refusals import refuses
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
@@ -79,9 +80,8 @@ def test_arms_that_do_not_meet_set_out_at_once(arms, home) -> None:
 @pytest.mark.requirement("A-74")
 def test_an_arm_that_ends_in_the_way_is_no_matter_of_time(arms, home) -> None:
     left, right = (to_the_middle(arms[side], home) for side in ("left", "right"))
-    with pytest.raises(OpenArmError, match=r"right arm after .*openarm_left_\w+.* no rest before it helps") as caught:
+    with refuses(Code.IN_COLLISION, r"right arm after .*openarm_left_\w+.* no rest before it helps") as caught:
         least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], home)
-    assert caught.value.code == Code.IN_COLLISION
     assert "longer" not in caught.value.message
 
 
@@ -89,9 +89,8 @@ def test_a_rest_that_is_too_long_is_refused(arms, meeting) -> None:
     state, left, right = meeting
     with pytest.raises(OpenArmError, match=r"within 0\.2 s; it would have to wait longer"):
         least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], state, longest=0.2)
-    with pytest.raises(OpenArmError) as caught:
+    with refuses(Code.CANCELLED):
         least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], state, stopped=lambda: True)
-    assert caught.value.code == Code.CANCELLED
 
 
 @pytest.mark.requirement("N-12")

@@ -16,6 +16,7 @@ from openarm_motion.collision.solids import Box
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.ompl_planner import OmplPlanner
 from openarm_motion.planning.planner import PlannedPath, PlanQuery
+from tests.refusals import refuses
 
 
 def query(arm: Arm, scene: CollisionScene, start: np.ndarray, goals: np.ndarray, **kwargs: object) -> PlanQuery:
@@ -121,9 +122,8 @@ def test_what_has_no_way_is_given_up_in_time() -> None:
         edge_free=edge_free,
         time_limit=0.3,
     )
-    with pytest.raises(OpenArmError, match=r"no free path to any of 2 goal.* within 0\.3 s") as caught:
+    with refuses(Code.NO_PLAN, r"no free path to any of 2 goal.* within 0\.3 s"):
         OmplPlanner().plan(nothing)
-    assert caught.value.code == Code.NO_PLAN
 
 
 @pytest.mark.requirement("N-18")
@@ -166,9 +166,8 @@ def test_a_plan_can_be_stopped(right: Arm, home: dict[str, float]) -> None:
         asked.append(True)
         return len(asked) > 3
 
-    with pytest.raises(OpenArmError) as caught:
+    with refuses(Code.CANCELLED):
         OmplPlanner().plan(query(right, scene, np.zeros(7), q_of(right, home), stopped=stopped))
-    assert caught.value.code == Code.CANCELLED
 
 
 def test_the_reason_for_no_plan_names_what_blocks_the_direct_way(right: Arm, home: dict[str, float]) -> None:

@@ -17,6 +17,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_perception.frames.images import intrinsics_of, read_frame, read_intrinsics, read_pose
 from openarm_perception.frames.pcd import OrganisedCloud, read_pcd, unpack_lzf, write_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
+from tests.refusals import refuses
 
 LIMITS = DepthLimits(near=0.1, far=5.0)
 LENS = Intrinsics(16, 12, 20.0, 21.0, 7.5, 5.0)
@@ -109,9 +110,8 @@ def test_other_pcd_files_are_refused(tmp_path, change, said):
     data = path.read_bytes()
     assert change[0] in data
     path.write_bytes(data.replace(*change, 1))
-    with pytest.raises(OpenArmError, match=said) as error:
+    with refuses(Code.BAD_IMAGE, said):
         read_pcd(path)
-    assert error.value.code == Code.BAD_IMAGE
 
 
 @given(st.binary(max_size=200), st.integers(0, 300))
@@ -162,9 +162,8 @@ def test_intrinsics_are_read(tmp_path, text):
 )
 def test_other_intrinsics_are_refused(tmp_path, text, said):
     (tmp_path / "k").write_text(text)
-    with pytest.raises(OpenArmError, match=said) as error:
+    with refuses(Code.BAD_IMAGE, said) as error:
         read_intrinsics(tmp_path / "k", (16, 12))
-    assert error.value.code == Code.BAD_IMAGE
     assert "expected" in error.value.message
 
 

@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a test expects of a call that must be refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from openarm_common.errors import Code, OpenArmError
+
+
+@contextmanager
+def refuses(
+    code: Code, match: str | None = None, error: type[OpenArmError] = OpenArmError
+) -> Iterator[pytest.ExceptionInfo[OpenArmError]]:
+    """Expect an error with this code, in whose text the pattern is found."""
+    with pytest.raises(error, match=match) as caught:
+        yield caught
+    assert caught.value.code is code, caught.value
