@@ -155,6 +155,19 @@ class RosProbe:
         self.nodes.append(node)
         return node
 
+    def start(self, kind, /, **parameters: object):
+        """Add a node of a class with parameters; a dot in a name may be written __."""
+        from rclpy.parameter import Parameter
+
+        overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
+        return self.add(kind(parameter_overrides=overrides))
+
+    def hear(self, kind: type, topic: str, qos: object = 10) -> list:
+        """The messages of a topic from now on."""
+        got: list = []
+        self.node.create_subscription(kind, topic, got.append, qos)
+        return got
+
     def spin_until(self, condition: Callable[[], object], timeout: float = DEADLINE_S, what: str = "") -> None:
         """Spin until `condition` holds; fail with `what` after `timeout` seconds."""
         deadline = time.monotonic() + timeout
@@ -162,6 +175,19 @@ class RosProbe:
             if time.monotonic() > deadline:
                 pytest.fail(f"not within {timeout:g} s: {what or 'the condition'}")
             self.executor.spin_once(timeout_sec=0.05)
+
+    def send_until(self, send: Callable[[], None], every: float, condition: Callable[[], object], what: str) -> None:
+        """Send, and again after `every` seconds (best effort may lose one), until `condition` holds."""
+        due = 0.0
+
+        def step() -> object:
+            nonlocal due
+            if time.monotonic() >= due:
+                due = time.monotonic() + every
+                send()
+            return condition()
+
+        self.spin_until(step, what=what)
 
     def result(self, future, timeout: float = DEADLINE_S, what: str = "the answer"):
         """Spin until a future is done and return its result."""

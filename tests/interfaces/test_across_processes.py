@@ -81,8 +81,7 @@ def peer():
 
 
 def test_a_message_a_service_and_actions_make_the_round_trip(ros, peer) -> None:
-    heard: list[TFMessage] = []
-    ros.node.create_subscription(TFMessage, "/transforms", heard.append, 1)
+    heard = ros.hear(TFMessage, "/transforms", 1)
     ros.spin_until(lambda: heard, what="a transform of the other process")
     assert heard[0].transforms[0].child_frame_id == "tool"
 

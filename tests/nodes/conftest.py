@@ -73,9 +73,7 @@ class Bench:
 
     # --- hearing
     def collect(self, kind: type, topic: str, qos) -> list:
-        got: list = []
-        self.ros.node.create_subscription(kind, topic, got.append, qos)
-        return got
+        return self.ros.hear(kind, topic, qos)
 
     def fresh(self, got: list, n: int = 1) -> list:
         """The next n messages of a list that are later than what is on its way now."""

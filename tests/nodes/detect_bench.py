@@ -3,11 +3,8 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from tf2_msgs.msg import TFMessage
 from vision_msgs.msg import Detection3DArray
@@ -97,7 +94,7 @@ class Bench:
             camera.publish_mount()
         # no joint states come for a camera that is fixed, and its frames do not wait for them
         values = {"camera": camera.config.name, "transform_wait": 0.02, **params}
-        self.node = ros.add(DetectNode(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()]))
+        self.node = ros.start(DetectNode, **values)
         self.watch = Watch(ros, Detection3DArray, "/detections_3d")
         self.diagnostics = Watch(ros, DiagnosticArray, "/diagnostics")
         self.t_ns = 1_000 * MS
@@ -112,17 +109,12 @@ class Bench:
 
         `make` gives functions of the stamp that replace the message of a stream.
         """
-        due = 0.0
 
-        def step() -> bool:
-            nonlocal due
-            if time.monotonic() >= due:
-                due = time.monotonic() + 0.1
-                t_ns = self.t_ns + 200 * MS
-                self.frame(**{stream: message(t_ns) for stream, message in make.items()})
-            return condition()
+        def send() -> None:
+            t_ns = self.t_ns + 200 * MS
+            self.frame(**{stream: message(t_ns) for stream, message in make.items()})
 
-        self.ros.spin_until(step, what=what)
+        self.ros.send_until(send, 0.1, condition, what)
 
     def detect(self, what: str = "a detection") -> Detection3DArray:
         """The answer to a frame that is newer than every one before."""

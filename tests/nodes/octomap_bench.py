@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from octomap_msgs.msg import Octomap
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
@@ -71,11 +69,9 @@ class Bench:
         all_params = {
             "cameras": ["overhead"], "period": 0.05, "field.name": f"test_{tmp_path.name}", "cloud_topic": "", **params
         }  # fmt: skip
-        self.node = ros.add(OctomapNode(parameter_overrides=[Parameter(k, value=v) for k, v in all_params.items()]))
-        self.maps: list[Octomap] = []
-        self.said: list[DiagnosticArray] = []
-        node.create_subscription(Octomap, "octomap_binary", self.maps.append, QOS_LATCHED)
-        node.create_subscription(DiagnosticArray, "/diagnostics", self.said.append, 10)
+        self.node = ros.start(OctomapNode, **all_params)
+        self.maps: list[Octomap] = ros.hear(Octomap, "octomap_binary", QOS_LATCHED)
+        self.said: list[DiagnosticArray] = ros.hear(DiagnosticArray, "/diagnostics")
         self.t_ns = 1_000_000_000
 
     def send(self, image: Image, *, joints: bool = True, info: CameraInfo | None = None) -> None:
@@ -90,19 +86,13 @@ class Bench:
 
     def show(self, pixels: np.ndarray, condition, what: str, encoding: str = "16UC1", **kwargs) -> None:
         """Publish the same view with new stamps until `condition` holds."""
-        due = 0.0
 
-        def step() -> bool:
-            nonlocal due
-            if time.monotonic() >= due:
-                due = time.monotonic() + 0.1
-                self.t_ns += 100_000_000
-                self.send(
-                    array_to_image(pixels, encoding, kwargs.get("frame", FRAME), self.t_ns), **kwargs.get("send", {})
-                )
-            return bool(condition())
+        def send() -> None:
+            self.t_ns += 100_000_000
+            image = array_to_image(pixels, encoding, kwargs.get("frame", FRAME), self.t_ns)
+            self.send(image, **kwargs.get("send", {}))
 
-        self.ros.spin_until(step, what=what)
+        self.ros.send_until(send, 0.1, condition, what)
 
     def state(self, point: tuple[float, float, float], message: Octomap | None = None) -> str:
         """What a map (the newest one) says of a point."""

@@ -8,7 +8,6 @@ import pytest
 from control_msgs.action import FollowJointTrajectory, ParallelGripperCommand
 from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action import ActionClient
-from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -32,8 +31,7 @@ def robot(bridge) -> Bench:
 @pytest.fixture
 def bench(robot: Bench) -> Bench:
     """And the node before it."""
-    overrides = [Parameter(name, value=value) for name, value in PATIENT.items()]
-    robot.client = robot.ros.add(ArmControl(parameter_overrides=overrides))
+    robot.client = robot.ros.start(ArmControl, **PATIENT)
     robot.passed_on = robot.collect(JointState, "/arm_control/joint_states", QOS_COMMAND)
     name = "/arm_control/right_joint_trajectory_controller/controller_state"
     robot.states = robot.collect(JointTrajectoryControllerState, name, QOS_COMMAND)

@@ -6,10 +6,7 @@ That of the detector is in `test_detect_node`.
 
 from __future__ import annotations
 
-import time
-
 import pytest
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Empty
 
@@ -30,9 +27,8 @@ class Arm(Bench):
     def __init__(self, ros, tmp_path) -> None:
         super().__init__(ros, tmp_path, transform_wait=5.0)
         params = {"cameras": ["overhead"], "self_filter.enabled": True, "transform_wait": 5.0}
-        self.cloud_node = ros.add(CloudNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()]))
-        self.clouds: list[PointCloud2] = []
-        ros.node.create_subscription(PointCloud2, "/overhead/depth/points", self.clouds.append, QOS_SENSOR)
+        self.cloud_node = ros.start(CloudNode, **params)
+        self.clouds: list[PointCloud2] = ros.hear(PointCloud2, "/overhead/depth/points", QOS_SENSOR)
         ros.spin_until(lambda: self.joints.get_subscription_count() == 2, what="both listen to the joints")
         tool = ROBOT.link_pose("openarm_left_hand_tcp", dict.fromkeys(JOINTS, 0.0))
         self.image = sheet(tool[2, 3])
@@ -46,17 +42,12 @@ class Arm(Bench):
         self.joints.publish(state)
 
     def show_until(self, condition, what: str) -> None:
-        """Publish the image, and again every half second (best effort may lose one), until `condition` holds."""
-        due = 0.0
+        """Publish the image, and again every half second, until `condition` holds."""
 
-        def step() -> bool:
-            nonlocal due
-            if time.monotonic() >= due:
-                due = time.monotonic() + 0.5
-                self.send(array_to_image(self.image, "16UC1", FRAME, self.t_ns), joints=False)
-            return bool(condition())
+        def send() -> None:
+            self.send(array_to_image(self.image, "16UC1", FRAME, self.t_ns), joints=False)
 
-        self.ros.spin_until(step, what=what)
+        self.ros.send_until(send, 0.5, condition, what)
 
     def made(self) -> bool:
         """Whether there are a cloud and a map of the image."""

@@ -9,13 +9,13 @@ import subprocess
 import sys
 import textwrap
 import threading
+from functools import partial
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from pydantic import Field
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from openarm_common.config import Config
@@ -36,11 +36,7 @@ class _Example(Config):
 
 @pytest.mark.requirement("B-62")
 def test_parameters_come_from_the_model_and_take_overrides(ros) -> None:
-    node = ros.add(
-        BaseNode(
-            "example", _Example, parameter_overrides=[Parameter("rate", value=50), Parameter("limits.force", value=5.0)]
-        )
-    )
+    node = ros.start(partial(BaseNode, "example", _Example), rate=50, limits__force=5.0)
     assert node.config == _Example(rate=50.0, limits=_Limits(force=5.0))
     descriptor = node.describe_parameter("rate")
     assert descriptor.description == "Hz"
@@ -50,7 +46,7 @@ def test_parameters_come_from_the_model_and_take_overrides(ros) -> None:
 
 def test_a_wrong_parameter_is_named_with_its_value(ros) -> None:
     with pytest.raises(OpenArmError, match=r"/example:rate: .*greater than 0.*got -1"):
-        BaseNode("example", _Example, parameter_overrides=[Parameter("rate", value=-1.0)])
+        ros.start(partial(BaseNode, "example", _Example), rate=-1.0)
 
 
 def test_a_value_of_an_unknown_type_is_refused_and_the_node_goes_on(ros) -> None:
@@ -67,8 +63,7 @@ def test_a_value_of_an_unknown_type_is_refused_and_the_node_goes_on(ros) -> None
 
 
 def test_diagnostics_are_published_each_second(ros) -> None:
-    got: list[DiagnosticArray] = []
-    ros.node.create_subscription(DiagnosticArray, "/diagnostics", got.append, QOS_COMMAND)
+    got = ros.hear(DiagnosticArray, "/diagnostics", QOS_COMMAND)
     node = ros.add(BaseNode("example", _Example))
     node.diagnose(True, "all is well", frames=3)
     ros.spin_until(lambda: any(s.message == "all is well" for m in got for s in m.status), what="a status")

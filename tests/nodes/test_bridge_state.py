@@ -228,10 +228,8 @@ def test_depth_is_noisy_and_in_metres_by_parameter(bridge) -> None:
 @pytest.mark.requirement("P-34")
 def test_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> None:
     """With cameras on and a trajectory under way: no error is logged, and the exit code is 0."""
-    joints: list[JointState] = []
-    images: list[Image] = []
-    ros.node.create_subscription(JointState, "/joint_states", joints.append, QOS_COMMAND)
-    ros.node.create_subscription(Image, "/overhead/color/image_raw", images.append, QOS_SENSOR)
+    joints = ros.hear(JointState, "/joint_states", QOS_COMMAND)
+    images = ros.hear(Image, "/overhead/color/image_raw", QOS_SENSOR)
     client = ActionClient(ros.node, FollowJointTrajectory, "/right_joint_trajectory_controller/follow_joint_trajectory")
     command = [sys.executable, "-m", "openarm_sim_bridge.ros.node", "--ros-args", "-p", "scene:=empty"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
@@ -253,8 +251,7 @@ def test_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> None:
 
 def test_the_twist_of_an_object_is_its_linear_and_its_angular_velocity(ros) -> None:
     states = StatePublisher(ros.node, RobotDescription.load(), (), 50.0, 20.0, clock=False, robot=False)
-    got: list[ObjectStateArray] = []
-    ros.node.create_subscription(ObjectStateArray, "/sim/ground_truth/objects", got.append, reliable(5))
+    got = ros.hear(ObjectStateArray, "/sim/ground_truth/objects", reliable(5))
     moving = ObjectReadout(load_scene("demo").objects[0], np.eye(4), np.array([1.0, 2, 3]), np.array([4.0, 5, 6]))
 
     def heard() -> bool:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,6 @@ import pytest
 pytest.importorskip("openarm_interfaces")
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, Imu
 
 from openarm_common.errors import OpenArmError
@@ -27,16 +27,6 @@ from tests.openarm_hardware.test_cameras import HEIGHT, WIDTH, calibration, film
 pytestmark = pytest.mark.requirement("R-09", "P-27")
 
 
-def parameters(**values: Any) -> list[Parameter]:
-    return [Parameter(name, value=value) for name, value in values.items()]
-
-
-def collect(ros: Any, kind: type, topic: str, qos: Any = QOS_SENSOR) -> list[Any]:
-    got: list[Any] = []
-    ros.node.create_subscription(kind, topic, got.append, qos)
-    return got
-
-
 def messages_of(reports: list[DiagnosticArray], node: str) -> list[str]:
     return [status.message for report in reports for status in report.status if status.name.startswith(node)]
 
@@ -44,11 +34,10 @@ def messages_of(reports: list[DiagnosticArray], node: str) -> list[str]:
 def test_a_usb_camera_has_the_topics_of_a_camera_without_depth_and_is_opened_again(ros: Any, tmp_path: Path) -> None:
     calibration(tmp_path)
     values = {"width": WIDTH, "height": HEIGHT, "calibration": str(tmp_path / "camera.yaml"), "camera": "desk"}
-    images, infos = (
-        collect(ros, kind, f"/desk/color/{n}") for kind, n in ((Image, "image_raw"), (CameraInfo, "camera_info"))
-    )
-    reports = collect(ros, DiagnosticArray, "/diagnostics", QOS_COMMAND)
-    ros.add(usb_camera.make(parameter_overrides=parameters(**values, device=str(tmp_path / "film.avi"))))
+    images = ros.hear(Image, "/desk/color/image_raw", QOS_SENSOR)
+    infos = ros.hear(CameraInfo, "/desk/color/camera_info", QOS_SENSOR)
+    reports = ros.hear(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    ros.start(usb_camera.make, **values, device=str(tmp_path / "film.avi"))
     ros.spin_until(lambda: any("can't open" in text for text in messages_of(reports, "usb_camera")), what="a refusal")
     film(tmp_path, 200)  # now it is plugged in
     ros.spin_until(lambda: any(i.header in [info.header for info in infos] for i in images), what="a picture, its info")
@@ -69,7 +58,7 @@ def test_a_realsense_has_the_topics_of_the_simulated_cameras_and_is_opened_again
     width, height = realsense_device.WIDTH, realsense_device.HEIGHT
     plugged: list[SoftwareRealSense] = []
     got = {
-        topic: collect(ros, kind, f"/overhead/{topic}")
+        topic: ros.hear(kind, f"/overhead/{topic}", QOS_SENSOR)
         for kind, topic in (
             (Image, "color/image_raw"),
             (CameraInfo, "color/camera_info"),
@@ -78,17 +67,13 @@ def test_a_realsense_has_the_topics_of_the_simulated_cameras_and_is_opened_again
             (Imu, "imu"),
         )
     }
-    reports = collect(ros, DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    reports = ros.hear(DiagnosticArray, "/diagnostics", QOS_COMMAND)
     values = {"camera": "overhead", "serial": "42", "width": width, "height": height, "rate": 30.0}
-    ros.add(
-        CameraNode(
-            "realsense_camera",
-            RealsenseConfig,
-            lambda config: RealSense(config, lambda: [one.device for one in plugged]),
-            silent_s=0.5,
-            parameter_overrides=parameters(**values),
-        )
-    )
+
+    def opened(config: RealsenseConfig) -> RealSense:
+        return RealSense(config, lambda: [one.device for one in plugged])
+
+    ros.start(partial(CameraNode, "realsense_camera", RealsenseConfig, opened, silent_s=0.5), **values)
     color, depth = np.full((height, width, 3), 90, np.uint8), np.full((height, width), 640, np.uint16)
 
     def streams(device: SoftwareRealSense) -> bool:

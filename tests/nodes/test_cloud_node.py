@@ -3,12 +3,9 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from openarm_common.camera.cameras import load_cameras
@@ -29,28 +26,22 @@ class Bench:
         self.ros = ros
         self.depth = ros.node.create_publisher(Image, "/overhead/depth/image_raw", QOS_SENSOR)
         self.info = ros.node.create_publisher(CameraInfo, "/overhead/depth/camera_info", QOS_SENSOR)
-        self.node = ros.add(CloudNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()]))
+        self.node = ros.start(CloudNode, **params)
         self.clouds: list[PointCloud2] = []
-        self.said: list[str] = []
         self.t_ns = 0
 
     def watch(self):
         return self.ros.node.create_subscription(PointCloud2, "/overhead/depth/points", self.clouds.append, QOS_SENSOR)
 
     def pump(self, pixels, encoding: str, condition, what: str, frame: str = FRAME, K=K) -> None:
-        """Publish a frame each half second (best effort may lose one) until `condition` holds."""
-        due = 0.0
+        """Publish a frame each half second until `condition` holds."""
 
-        def step() -> bool:
-            nonlocal due
-            if time.monotonic() >= due:
-                due = time.monotonic() + 0.5
-                self.t_ns += 33_000_000
-                self.depth.publish(array_to_image(pixels, encoding, frame, self.t_ns))
-                self.info.publish(info_from_intrinsics(K, frame, self.t_ns))
-            return condition()
+        def send() -> None:
+            self.t_ns += 33_000_000
+            self.depth.publish(array_to_image(pixels, encoding, frame, self.t_ns))
+            self.info.publish(info_from_intrinsics(K, frame, self.t_ns))
 
-        self.ros.spin_until(step, what=what)
+        self.ros.send_until(send, 0.5, condition, what)
 
 
 def flat(millimetres: int = 700):
@@ -132,7 +123,7 @@ def test_colour_comes_with_the_points_when_asked_for(ros) -> None:
 )
 def test_what_takes_points_away_is_not_organised(ros, params) -> None:
     with pytest.raises(OpenArmError, match=r"set organised to (false as well .--set cloud|true, or color)"):
-        CloudNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()])
+        ros.start(CloudNode, **params)
 
 
 @pytest.mark.requirement("A-58")
@@ -154,8 +145,7 @@ def test_what_does_not_fit_is_named_and_dropped(ros) -> None:
     """On /diagnostics; no cloud comes of it."""
     bench = Bench(ros)
     bench.watch()
-    said: list[DiagnosticArray] = []
-    ros.node.create_subscription(DiagnosticArray, "/diagnostics", said.append, 10)
+    said = ros.hear(DiagnosticArray, "/diagnostics")
     for pixels, encoding, frame, text in (
         (np.zeros((480, 640), np.uint8), "mono8", FRAME, "16UC1"),
         (np.zeros((240, 320), np.uint16), "16UC1", FRAME, "320x240"),
@@ -172,4 +162,4 @@ def test_what_does_not_fit_is_named_and_dropped(ros) -> None:
 def test_an_unknown_camera_is_named(ros) -> None:
     """With those that there are."""
     with pytest.raises(OpenArmError, match="'rear' is unknown or has no depth; cameras: overhead, wrist"):
-        CloudNode(parameter_overrides=[Parameter("cameras", value=["rear"])])
+        ros.start(CloudNode, cameras=["rear"])

@@ -116,7 +116,7 @@ def test_the_height_of_the_table_is_measured_from_its_surface_or_a_block(ros, be
     """The detector is configured with 0.41 m; the camera sees 0.40 m."""
     camera = FakeCamera(ros)
     camera.publish_mount()
-    node = ros.add(DetectNode(parameter_overrides=[Parameter("table_height", value=0.41)], namespace="other"))
+    node = ros.start(partial(DetectNode, namespace="other"), table_height=0.41)
     client = ros.node.create_client(MeasureTable, "/other/detector/measure_table")
 
     def ask(**fields) -> MeasureTable.Response:
@@ -323,4 +323,4 @@ def test_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) -> None:
 def test_wrong_parameters_are_named(ros, key, value, fault) -> None:
     """The valid choices are listed."""
     with pytest.raises(OpenArmError, match=fault):
-        DetectNode(parameter_overrides=[Parameter(key, value=value)])
+        ros.start(DetectNode, **{key: value})

@@ -9,7 +9,6 @@ import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from openarm_interfaces.srv import SaveRecording
-from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.requirement("R-24")
 def start(ros, tmp_path: Path):
     def make(**parameters: object) -> FlightRecorder:
         given = {"folder": str(tmp_path), "topics": ["/chatter|/latched"], "on_demand": ["/costly"], **parameters}
-        return ros.add(FlightRecorder(parameter_overrides=[Parameter(name, value=v) for name, v in given.items()]))
+        return ros.start(FlightRecorder, **given)
 
     return make
 

@@ -25,12 +25,10 @@ class Foxglove:
     """A node with a websocket client of it, which runs in a thread while the node is spun."""
 
     def __init__(self, ros) -> None:
-        from rclpy.parameter import Parameter
-
         from openarm_bringup.view.ros.foxglove_node import FoxgloveNode
 
         self.ros = ros
-        self.node = ros.add(FoxgloveNode(parameter_overrides=[Parameter("port", value=0)]))
+        self.node = ros.start(FoxgloveNode, port=0)
 
     def address(self, token: str | None = None) -> str:
         return f"ws://127.0.0.1:{self.node.port}/?token={self.node.token if token is None else token}"

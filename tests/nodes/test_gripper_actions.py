@@ -10,7 +10,6 @@ from action_msgs.msg import GoalStatus
 from control_msgs.action import GripperCommand
 from control_msgs.msg import GripperCommand as Command
 from rclpy.action import ActionClient, get_action_names_and_types
-from rclpy.parameter import Parameter
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.ros.node import GraspNode
@@ -51,8 +50,7 @@ def test_the_classic_action_reaches_the_real_joint(bridge) -> None:
 def test_the_grasp_node_speaks_the_type_that_the_bridge_serves(bridge, action: str) -> None:
     bench = bridge(images=False, gripper_action=action)
     ros = bench.ros
-    overrides = [Parameter("gripper_action", value=action)]
-    grasp = ros.add(GraspNode(parameter_overrides=overrides))
+    grasp = ros.start(GraspNode, gripper_action=action)
     faults: list[OpenArmError] = []
 
     async def grip() -> bool:
@@ -70,7 +68,7 @@ def test_the_grasp_node_speaks_the_type_that_the_bridge_serves(bridge, action: s
 
 def test_a_wrong_type_is_refused_by_name(ros) -> None:
     with pytest.raises(OpenArmError, match=r"gripper_action.*'parallel', 'classic' or 'trajectory'") as caught:
-        GraspNode(parameter_overrides=[Parameter("gripper_action", value="suction")])
+        ros.start(GraspNode, gripper_action="suction")
     assert caught.value.code is Code.CONFIG_INVALID
 
 
@@ -79,11 +77,7 @@ def test_a_gripper_behind_a_trajectory_controller_is_asked_for_a_position(bridge
     """As openarm_ros2 has it: the goal succeeds when its time is over, joint states say where the fingers are."""
     bench = bridge(images=False, controllers="openarm_ros2")
     ros, name = bench.ros, "/{arm}_gripper_controller/follow_joint_trajectory"
-    grasp = ros.add(
-        GraspNode(
-            parameter_overrides=[Parameter("gripper_action", value="trajectory"), Parameter("gripper", value=name)]
-        )
-    )
+    grasp = ros.start(GraspNode, gripper_action="trajectory", gripper=name)
 
     async def grip() -> bool:
         await grasp._robot._nodes.begin(list)

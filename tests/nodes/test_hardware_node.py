@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -38,12 +37,12 @@ class Bench(BridgeBench):
     def __init__(self, ros, folder: Path) -> None:
         made = {"profile": "openarm", "controllers": "motors", "scene": "empty", "images": False}
         self.ros = ros
-        self.node = ros.add(MujocoBridge(parameter_overrides=[Parameter(k, value=v) for k, v in made.items()]))
+        self.node = ros.start(MujocoBridge, **made)
         self.joints, self.joint_arrivals = list[JointState](), list[float]()
         ros.node.create_subscription(JointState, "/joint_states", self._on_joints, QOS_COMMAND)
         self.reports: list[DiagnosticArray] = self.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
         values = {**PATIENT, "emulated": True, "calibrations": str(folder), "dynamics_seed": 1}
-        self.hardware = ros.add(OpenArmHardware(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()]))
+        self.hardware = ros.start(OpenArmHardware, **values)
         ros.spin_until(
             lambda: self.report().get("right_phase") == "FOLLOWING" and self.level() == b"\0", what="arms up"
         )

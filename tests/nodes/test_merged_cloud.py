@@ -3,11 +3,8 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
 from tf2_msgs.msg import TFMessage
 
@@ -48,9 +45,8 @@ class Moving:
         edges = [(c.parent, c.optical_frame, c.T_parent_optical) for c in self.scene.cameras.values()]
         self.static.publish(TFMessage(transforms=[matrix_to_transform(*edge, 0) for edge in edges]))
         params = {"self_filter.enabled": True, "transform_wait": 5.0, "merged_age": 10.0, **params}
-        self.node = ros.add(CloudNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()]))
-        self.merged: list[PointCloud2] = []
-        ros.node.create_subscription(PointCloud2, "/points", self.merged.append, QOS_SENSOR)
+        self.node = ros.start(CloudNode, **params)
+        self.merged: list[PointCloud2] = ros.hear(PointCloud2, "/points", QOS_SENSOR)
         self.images = {}
         for name, after in (("overhead", 0), ("wrist", LATER)):
             self.scene.joints = self.at(after)
@@ -64,29 +60,29 @@ class Moving:
         name = "openarm_right_joint1"
         return self.home | {name: self.home[name] + SPEED * offset_ns * 1e-9}
 
-    def show(self) -> tuple[int, PointCloud2]:
-        """Publish both images and the joint states around them until they are merged; their first stamp, the cloud."""
-        t_ns, due = 1_000 * MS, 0.0
+    def show(self) -> PointCloud2:
+        """Publish both images and the joint states around them until they are merged; the cloud."""
+        t_ns = 1_000 * MS
 
-        def step() -> bool:
-            nonlocal t_ns, due
-            if time.monotonic() >= due:
-                due = time.monotonic() + 1.0  # best effort may lose one
-                t_ns += 1_000 * MS
-                for offset in range(-20, 101, 10):
-                    q = self.at(offset * MS)
-                    speed = [SPEED if name == "openarm_right_joint1" else 0.0 for name in q]
-                    state = JointState(name=list(q), position=list(q.values()), velocity=speed)
-                    state.header.stamp = ns_to_stamp(t_ns + offset * MS)
-                    self.joints.publish(state)
-                for name, (after, scan) in self.images.items():
-                    frame = self.scene.cameras[name].optical_frame
-                    self.depth[name].publish(array_to_image(scan.depth, "16UC1", frame, t_ns + after))
-                    self.info[name].publish(info_from_intrinsics(scan.intrinsics, frame, t_ns + after))
+        def send() -> None:
+            nonlocal t_ns
+            t_ns += 1_000 * MS
+            for offset in range(-20, 101, 10):
+                q = self.at(offset * MS)
+                speed = [SPEED if name == "openarm_right_joint1" else 0.0 for name in q]
+                state = JointState(name=list(q), position=list(q.values()), velocity=speed)
+                state.header.stamp = ns_to_stamp(t_ns + offset * MS)
+                self.joints.publish(state)
+            for name, (after, scan) in self.images.items():
+                frame = self.scene.cameras[name].optical_frame
+                self.depth[name].publish(array_to_image(scan.depth, "16UC1", frame, t_ns + after))
+                self.info[name].publish(info_from_intrinsics(scan.intrinsics, frame, t_ns + after))
+
+        def merged() -> bool:
             return any(stamp_to_ns(cloud.header.stamp) % (1_000 * MS) == LATER for cloud in self.merged)
 
-        self.ros.spin_until(step, what="a merged cloud")
-        return t_ns, self.merged[-1]
+        self.ros.send_until(send, 1.0, merged, "a merged cloud")
+        return self.merged[-1]
 
 
 @pytest.fixture
@@ -106,7 +102,7 @@ def moving(ros):
 def test_the_clouds_of_both_cameras_meet_within_5_mm_though_one_of_them_moves(moving) -> None:
     """Each at its own stamp; with the newest posture of the arm in its place the wrist camera's would not."""
     bench = moving()
-    _, cloud = bench.show()
+    cloud = bench.show()
     assert cloud.header.frame_id == BASE_FRAME
     points = points_from_cloud(cloud).astype(np.float64)
     overhead, wrist = (bench.images[name][1] for name in ("overhead", "wrist"))
@@ -141,7 +137,7 @@ def test_the_clouds_of_both_cameras_meet_within_5_mm_though_one_of_them_moves(mo
 def test_filters_hold_for_the_merged_cloud(moving) -> None:
     """One point a cell of 1 cm where both cameras look, also with outliers dropped."""
     bench = moving(organised=False, **{"filter.voxel": 0.01, "filter.outliers": True})
-    _, cloud = bench.show()
+    cloud = bench.show()
     points = points_from_cloud(cloud)
     cells = np.floor(points.astype(np.float64) / 0.01 + 1e-6)
     assert 5_000 < len(points) < 100_000

@@ -14,7 +14,6 @@ from nav_msgs.msg import OccupancyGrid
 from octomap_msgs.msg import Octomap
 from octomap_msgs.srv import BoundingBoxQuery, GetOctomap
 from openarm_interfaces.srv import ClearMap, MapFile, QueryMap
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Empty
 from visualization_msgs.msg import Marker, MarkerArray
@@ -54,8 +53,7 @@ def test_images_become_a_latched_octree(bench) -> None:
     assert bench.state(ABOVE) == "free"
     newest = bench.maps[-1]
     assert (newest.header.frame_id, newest.id, newest.binary, newest.resolution) == (BASE_FRAME, "OcTree", True, 0.02)
-    late: list[Octomap] = []
-    bench.ros.node.create_subscription(Octomap, "octomap_full", late.append, QOS_LATCHED)
+    late = bench.ros.hear(Octomap, "octomap_full", QOS_LATCHED)
     bench.ros.spin_until(lambda: late, what="the full map")
     assert bench.state(ON_TABLE, late[0]) == "occupied"
     assert not late[0].binary
@@ -220,41 +218,33 @@ def test_clouds_are_a_second_input(ros, tmp_path) -> None:
     points = se3.apply(se3.inverse(T_BASE_CAMERA), at).astype(np.float32)
     points = np.concatenate([points, [[np.nan] * 3]]).astype(np.float32)
 
-    due = 0.0
-
-    def step() -> bool:
-        nonlocal due
-        if time.monotonic() < due:
-            return bench.state(ON_TABLE) == "occupied"
-        due = time.monotonic() + 0.1
+    def send() -> None:
         bench.t_ns += 100_000_000
         state = JointState(name=list(JOINTS), position=[0.0] * len(JOINTS))
         state.header.stamp = ns_to_stamp(bench.t_ns)
         bench.joints.publish(state)
         clouds.publish(cloud_from_points(points, FRAME, bench.t_ns))
-        return bench.state(ON_TABLE) == "occupied"
 
-    ros.spin_until(step, what="the point is in the map")
+    ros.send_until(send, 0.1, lambda: bench.state(ON_TABLE) == "occupied", "the point is in the map")
     assert bench.state(ABOVE) in ("free", "unknown")
 
 
 def test_pictures_of_the_map_while_it_has_a_subscriber(bench) -> None:
     """Centres, coloured cubes, the projection, and what changed."""
-    got: dict[str, list] = {"c": [], "m": [], "p": [], "d": []}
-    node = bench.ros.node
-    node.create_subscription(PointCloud2, "octomap_point_cloud_centers", got["c"].append, QOS_LATCHED)
-    node.create_subscription(MarkerArray, "occupied_cells_vis_array", got["m"].append, QOS_LATCHED)
-    node.create_subscription(OccupancyGrid, "projected_map", got["p"].append, QOS_LATCHED)
-    node.create_subscription(PointCloud2, "octomap_changes", got["d"].append, QOS_LATCHED)
-    bench.show(sheet(0.41), lambda: all(got.values()) and got["p"][-1].data.count(100), "all pictures")
-    centres = points_from_cloud(got["c"][-1])
-    assert np.abs(centres - np.array(ON_TABLE)).sum(axis=1).min() < 0.02
-    assert len(got["m"][-1].markers[0].points) == len(got["m"][-1].markers[0].colors) > 100
-    grid = got["p"][-1]
+    hear = bench.ros.hear
+    clouds = hear(PointCloud2, "octomap_point_cloud_centers", QOS_LATCHED)
+    cubes = hear(MarkerArray, "occupied_cells_vis_array", QOS_LATCHED)
+    grids = hear(OccupancyGrid, "projected_map", QOS_LATCHED)
+    changes = hear(PointCloud2, "octomap_changes", QOS_LATCHED)
+    got = (clouds, cubes, grids, changes)
+    bench.show(sheet(0.41), lambda: all(got) and grids[-1].data.count(100), "all pictures")
+    assert np.abs(points_from_cloud(clouds[-1]) - np.array(ON_TABLE)).sum(axis=1).min() < 0.02
+    assert len(cubes[-1].markers[0].points) == len(cubes[-1].markers[0].colors) > 100
+    grid = grids[-1]
     column = int((ON_TABLE[0] - grid.info.origin.position.x) / 0.02)
     row = int((ON_TABLE[1] - grid.info.origin.position.y) / 0.02)
     assert grid.data[row * grid.info.width + column] == 100
-    assert got["d"][-1].fields[3].name == "state"
+    assert changes[-1].fields[3].name == "state"
 
 
 @pytest.mark.requirement("B-28", "B-30", "B-34", "B-60")
@@ -306,13 +296,12 @@ def test_a_map_to_start_from_is_published_and_a_damaged_one_refused(ros, tmp_pat
     damaged = tmp_path / "damaged.bt"
     damaged.write_bytes(reference.read_bytes()[:2000])
     name = f"test_{tmp_path.name}_2"
-    params = {"map_file": str(damaged), "field.name": name}
     with pytest.raises(OpenArmError, match="octree is damaged"):
-        OctomapNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()])
+        ros.start(OctomapNode, map_file=str(damaged), field__name=name)
     assert not field_path(name).exists()
 
 
 def test_unknown_cameras_and_wrong_parameters_are_refused(ros) -> None:
     for params, text in (({"cameras": ["spectator"]}, "has no depth"), ({"grid.resolution": 0.0}, "grid.resolution")):
         with pytest.raises(OpenArmError, match=text):
-            OctomapNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()])
+            ros.start(OctomapNode, **params)

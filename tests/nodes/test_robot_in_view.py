@@ -3,12 +3,9 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
 from tf2_msgs.msg import TFMessage
 from vision_msgs.msg import Detection2DArray, Detection3DArray
@@ -50,7 +47,7 @@ class Bench:
     """Camera, joint states, what the hand holds; a node; and what it says."""
 
     def __init__(self, ros, node_type, kind, topic: str, **params) -> None:
-        self.ros, self.got, self.said = ros, [], {}
+        self.ros, self.said = ros, {}
         self.images = {
             "color/image_raw": ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_SENSOR),
             "depth/image_raw": ros.node.create_publisher(Image, "/overhead/depth/image_raw", QOS_SENSOR),
@@ -69,9 +66,8 @@ class Bench:
         self.rgb = np.full((480, 640, 3), (180, 176, 170), np.uint8)
         self.depth = np.full((480, 640), round(TABLE * 1e3), np.uint16)
         self.rgb[PATCH], self.depth[PATCH] = (205, 25, 25), round(TOP * 1e3)
-        self.node = ros.add(node_type(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()]))
-        qos = QOS_SENSOR if kind is PointCloud2 else reliable(10)
-        self.watch = ros.node.create_subscription(kind, topic, self.got.append, qos)
+        self.node = ros.start(node_type, **params)
+        self.got = ros.hear(kind, topic, QOS_SENSOR if kind is PointCloud2 else 10)
         self.heard = ros.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_said, reliable(10))
         self.t_ns = 1_000 * MS
         ros.spin_until(self.images["depth/image_raw"].get_subscription_count, what="the camera is listened to")
@@ -89,23 +85,18 @@ class Bench:
 
     def pump(self, condition, what: str, *, joints: bool = True) -> None:
         """A frame every 0.2 s, with joint states just before and after its stamp, until `condition` holds."""
-        due = 0.0
 
-        def step() -> bool:
-            nonlocal due
-            if time.monotonic() >= due:
-                due = time.monotonic() + 0.2
-                self.t_ns += 200 * MS
-                for offset in (-8, 2) if joints else ():
-                    state = JointState(name=list(JOINTS), position=list(JOINTS.values()))
-                    state.header.stamp = ns_to_stamp(self.t_ns + offset * MS)
-                    self.joints.publish(state)
-                self.images["color/image_raw"].publish(array_to_image(self.rgb, "rgb8", FRAME, self.t_ns))
-                self.images["depth/image_raw"].publish(array_to_image(self.depth, "16UC1", FRAME, self.t_ns))
-                self.images["depth/camera_info"].publish(info_from_intrinsics(K, FRAME, self.t_ns))
-            return bool(condition())
+        def send() -> None:
+            self.t_ns += 200 * MS
+            for offset in (-8, 2) if joints else ():
+                state = JointState(name=list(JOINTS), position=list(JOINTS.values()))
+                state.header.stamp = ns_to_stamp(self.t_ns + offset * MS)
+                self.joints.publish(state)
+            self.images["color/image_raw"].publish(array_to_image(self.rgb, "rgb8", FRAME, self.t_ns))
+            self.images["depth/image_raw"].publish(array_to_image(self.depth, "16UC1", FRAME, self.t_ns))
+            self.images["depth/camera_info"].publish(info_from_intrinsics(K, FRAME, self.t_ns))
 
-        self.ros.spin_until(step, what=what)
+        self.ros.send_until(send, 0.2, condition, what)
 
 
 def detector(ros, **params) -> Bench:
@@ -118,12 +109,9 @@ def test_what_motion_holds_is_no_object_on_the_table(ros) -> None:
     """Reported until motion says that it is held; then found in the image alone, counted, and out of the mask."""
     bench = detector(ros)
     bench.pump(lambda: bench.got and bench.got[-1].detections, "the box is taken for an object")
-    in_image, masks, clouds = [], [], []
-    keep = (
-        ros.node.create_subscription(PointCloud2, "/detection_points", clouds.append, QOS_SENSOR),
-        ros.node.create_subscription(Detection2DArray, "/detections_2d", in_image.append, reliable(10)),
-        ros.node.create_subscription(Image, "/detection_mask", masks.append, QOS_SENSOR),
-    )
+    clouds = ros.hear(PointCloud2, "/detection_points", QOS_SENSOR)
+    in_image = ros.hear(Detection2DArray, "/detections_2d")
+    masks = ros.hear(Image, "/detection_mask", QOS_SENSOR)
     bench.pump(lambda: masks, "a mask")
     mask = image_to_array(masks[-1])
     assert (masks[-1].encoding, mask.shape) == ("mono8", (480, 640))
@@ -141,7 +129,6 @@ def test_what_motion_holds_is_no_object_on_the_table(ros) -> None:
     bench.pump(lambda: len(masks) > count + 1 and in_image, "a mask of what is held")
     assert not image_to_array(masks[-1]).any()
     assert len(in_image[-1].detections) == 1
-    assert len(keep) == 3
 
 
 def test_without_joint_states_objects_are_seen_and_the_lack_is_named(ros) -> None:

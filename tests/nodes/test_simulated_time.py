@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns
@@ -19,7 +18,7 @@ NOW = 123_000_000_000
 @pytest.mark.parametrize("kind", [MotionNode, DetectNode])
 @pytest.mark.requirement("P-30")
 def test_a_node_takes_simulated_time(ros, kind: type[BaseNode]) -> None:
-    node = ros.add(kind(parameter_overrides=[Parameter("use_sim_time", value=True)]))
+    node = ros.start(kind, use_sim_time=True)
     stamps: list[int] = []
     publisher = ros.node.create_publisher(Clock, "/clock", QOS_CLOCK)
     ros.node.create_subscription(

@@ -3,13 +3,10 @@
 
 from __future__ import annotations
 
-import time
-
 import cv2
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from openarm_common.camera.cameras import load_cameras
@@ -56,8 +53,7 @@ class Bench:
             )
             for camera in (self.left, self.right)
         }
-        overrides = [Parameter(name, value=value) for name, value in params.items()]
-        self.node = ros.add(StereoNode(parameter_overrides=overrides))
+        self.node = ros.start(StereoNode, **params)
         self.t_ns = 0
         self.baseline = self.right.baseline
         self.reports: list[str] = []
@@ -69,29 +65,19 @@ class Bench:
     def _hear(self, message) -> None:
         self.reports += [s.message for s in message.status if s.name.startswith("stereo_depth")]
 
-    def hear(self, kind: type, topic: str) -> list:
-        got: list = []
-        self.ros.node.create_subscription(kind, topic, got.append, QOS_SENSOR)
-        return got
-
     def pump(self, condition, what: str, apart_ns: int = 0) -> None:
-        """Publish a pair each quarter of a second (best effort may lose one) until `condition` holds."""
-        due = 0.0
+        """Publish a pair each quarter of a second until `condition` holds."""
 
-        def step() -> bool:
-            nonlocal due
-            if time.monotonic() >= due:
-                due = time.monotonic() + 0.25
-                self.t_ns += 250_000_000
-                for camera in (self.left, self.right):
-                    t_ns = self.t_ns + (apart_ns if camera is self.right else 0)
-                    image, info = self.publishers[camera.name]
-                    baseline = self.baseline if camera is self.right else 0.0
-                    info.publish(info_from_intrinsics(camera.intrinsics, camera.optical_frame, t_ns, baseline))
-                    image.publish(array_to_image(self.images[camera.name], "rgb8", camera.optical_frame, t_ns))
-            return condition()
+        def send() -> None:
+            self.t_ns += 250_000_000
+            for camera in (self.left, self.right):
+                t_ns = self.t_ns + (apart_ns if camera is self.right else 0)
+                image, info = self.publishers[camera.name]
+                baseline = self.baseline if camera is self.right else 0.0
+                info.publish(info_from_intrinsics(camera.intrinsics, camera.optical_frame, t_ns, baseline))
+                image.publish(array_to_image(self.images[camera.name], "rgb8", camera.optical_frame, t_ns))
 
-        self.ros.spin_until(step, what=what)
+        self.ros.send_until(send, 0.25, condition, what)
 
 
 @pytest.mark.long
@@ -99,12 +85,10 @@ class Bench:
 def test_depth_of_a_pair_is_what_the_cloud_node_takes(ros) -> None:
     """Depth, CameraInfo and cloud at the stamp of the left image, in its frame; the margin it alone sees is invalid."""
     bench = Bench(ros)
-    ros.add(CloudNode(parameter_overrides=[Parameter("cameras", value=["head_left"])]))
-    depths, infos = (
-        bench.hear(Image, "/head_left/depth/image_raw"),
-        bench.hear(CameraInfo, "/head_left/depth/camera_info"),
-    )
-    clouds = bench.hear(PointCloud2, "/head_left/depth/points")
+    ros.start(CloudNode, cameras=["head_left"])
+    depths = ros.hear(Image, "/head_left/depth/image_raw", QOS_SENSOR)
+    infos = ros.hear(CameraInfo, "/head_left/depth/camera_info", QOS_SENSOR)
+    clouds = ros.hear(PointCloud2, "/head_left/depth/points", QOS_SENSOR)
     bench.pump(lambda: depths and infos and clouds, "depth and a cloud")
     depth = depth_image(depths[0])
     assert (depths[0].encoding, depths[0].header.frame_id) == ("16UC1", bench.left.optical_frame)
@@ -123,7 +107,7 @@ def test_depth_of_a_pair_is_what_the_cloud_node_takes(ros) -> None:
 @pytest.mark.requirement("R-05")
 def test_a_pair_without_a_baseline_is_refused_with_the_reason_until_it_has_one(ros) -> None:
     bench = Bench(ros, encoding="32FC1", stamp_gap=0.01)
-    depths = bench.hear(Image, "/head_left/depth/image_raw")
+    depths = ros.hear(Image, "/head_left/depth/image_raw", QOS_SENSOR)
     bench.baseline = 0.0
     bench.pump(lambda: any("the baseline is" in text for text in bench.reports), "the reason", apart_ns=3_000_000)
     assert not depths
@@ -145,4 +129,4 @@ def test_it_listens_only_while_its_depth_is_wanted(ros) -> None:
 
 def test_a_camera_that_is_no_left_one_is_refused_with_those_that_are(ros) -> None:
     with pytest.raises(OpenArmError, match="left cameras: head_left"):
-        StereoNode(parameter_overrides=[Parameter("camera", value="ceiling")])
+        ros.start(StereoNode, camera="ceiling")

@@ -68,8 +68,7 @@ def test_joint_states_and_transforms_of_wrong_form_are_counted_and_change_nothin
     listener = RobotStateListener(ros.add(BaseNode("eye", Config)), RobotDescription.load())
     joints = ros.node.create_publisher(JointState, "/joint_states", reliable(100))
     edges = ros.node.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
-    reports: list[DiagnosticArray] = []
-    ros.node.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 10)
+    reports = ros.hear(DiagnosticArray, "/diagnostics")
     ros.spin_until(joints.get_subscription_count, what="the eye listens")
     good = JointState(name=["a", "b"], position=[0.1, 0.2])
     good.header.stamp = ns_to_stamp(5)
