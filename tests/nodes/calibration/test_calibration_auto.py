@@ -13,7 +13,6 @@ import pytest
 from openarm_interfaces.action import AutoCalibrate, MoveArm
 from openarm_interfaces.srv import TakeSample
 from rclpy.action import ActionClient, ActionServer, CancelResponse
-from rclpy.parameter import Parameter
 from rclpy.task import Future
 
 from openarm_calibration.handeye.refine import mount_error
@@ -86,7 +85,7 @@ class Bench:
                 key + "position": [round(v, 2) for v in Z[:3, 3]], key + "z_axis": Z[:3, 2].tolist(),
                 key + "y_axis": Z[:3, 1].tolist(),
             }  # fmt: skip
-        ros.add(CalibrationNode(parameter_overrides=[Parameter(k, value=v) for k, v in given.items()]))
+        ros.start(CalibrationNode, **given)
         self.client = ActionClient(ros.node, AutoCalibrate, "/calibration/auto")
         self.feedback: list[AutoCalibrate.Feedback] = []
 

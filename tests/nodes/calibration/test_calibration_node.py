@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from openarm_interfaces.srv import (
@@ -18,7 +20,6 @@ from openarm_interfaces.srv import (
     SetAlgorithm,
     TakeSample,
 )
-from rclpy.parameter import Parameter
 
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.ros.node import CalibrationNode
@@ -30,15 +31,12 @@ from tests.openarm_calibration.known_session import make_session
 MS = 1_000_000
 
 
-class Verbs:
-    """Calls of the services."""
-
-    def __init__(self, ros) -> None:
-        self._ros = ros
-
-    def __call__(self, kind, name: str, **fields):
-        client = self._ros.node.create_client(kind, f"/calibration/{name}")
-        return self._ros.call(client, kind.Request(**fields))
+@pytest.fixture
+def call(ros) -> Callable[..., Any]:
+    """Calls a service of the node: kind, name, fields of the request."""
+    return lambda kind, name, **fields: ros.call(
+        ros.node.create_client(kind, f"/calibration/{name}"), kind.Request(**fields)
+    )
 
 
 @pytest.fixture
@@ -47,26 +45,19 @@ def store(tmp_path: Path) -> CalibrationStore:
 
 
 def start(ros, store: CalibrationStore, camera: str = "wrist", **more) -> CalibrationNode:
-    given = {
-        "camera": camera,
-        "store": str(store.folder),
-        "mount_seed": 1,
-        "image_timeout": 20.0,
-        "state_timeout": 20.0,
-    }
-    return ros.add(CalibrationNode(parameter_overrides=[Parameter(k, value=v) for k, v in {**given, **more}.items()]))
+    patience = {"image_timeout": 20.0, "state_timeout": 20.0, **more}
+    return ros.start(CalibrationNode, camera=camera, store=str(store.folder), mount_seed=1, **patience)
 
 
 @pytest.mark.parametrize(
     ("camera", "setup"), [pytest.param("wrist", "in_hand", marks=pytest.mark.long), ("overhead", "to_hand")]
 )
 @pytest.mark.requirement("A-33", "A-34", "A-45")
-def test_from_images_to_a_stored_mount(ros, posed_robot, store, tmp_path: Path, camera: str, setup: str) -> None:
+def test_from_images_to_a_stored_mount(ros, call, posed_robot, store, tmp_path: Path, camera: str, setup: str) -> None:
     """Ten samples by service, solved and stored: the true mount to 0.3 mm and 0.03°; saved and loaded the same."""
     known = make_session(setup, 10, px=1e-9)
     robot = posed_robot(camera, known)
     start(ros, store, camera)
-    call = Verbs(ros)
     assert "first sample" in call(GetSampleList, "get_sample_list").advice
     for k in range(10):
         robot.pose(k)
@@ -95,11 +86,11 @@ def test_from_images_to_a_stored_mount(ros, posed_robot, store, tmp_path: Path, 
 
 
 @pytest.mark.requirement("A-44", "A-41")
-def test_refusals_come_with_a_code_and_the_node_goes_on(ros, posed_robot, store) -> None:
+def test_refusals_come_with_a_code_and_the_node_goes_on(ros, call, posed_robot, store) -> None:
     """Late stamps, a moving robot, no board, no image, too few samples, wrong names."""
     robot = posed_robot("wrist", make_session("in_hand", 3, px=1e-9))
     robot.pose(0)
-    node, call = start(ros, store, state_timeout=1.0), Verbs(ros)
+    node = start(ros, store, state_timeout=1.0)
     assert call(SaveCalibration, "save_calibration").code == "NOT_READY"
     nothing = call(ComputeCalibration, "compute_calibration")
     assert (nothing.success, nothing.code) == (False, "DEGENERATE")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo
 from tf2_msgs.msg import TFMessage
 
@@ -24,8 +23,7 @@ pytestmark = pytest.mark.usefixtures("own_store")
 
 def edges(ros) -> dict[tuple[str, str], np.ndarray]:
     """What a late listener gets."""
-    got: list[TFMessage] = []
-    ros.node.create_subscription(TFMessage, "/tf_static", got.append, QOS_STATIC_TF)
+    got = ros.hear(TFMessage, "/tf_static", QOS_STATIC_TF)
     ros.spin_until(lambda: got, what="/tf_static")
     assert len(got) == 1
     return {(e.header.frame_id, e.child_frame_id): transform_to_matrix(e.transform) for e in got[0].transforms}
@@ -69,7 +67,7 @@ def test_a_camera_on_an_unknown_link_is_refused(ros, tmp_path) -> None:
         "cameras: [{name: a, parent: nowhere, position: [0, 0, 0], forward: [1, 0, 0], image_right: [0, -1, 0]}]"
     )
     with pytest.raises(OpenArmError, match=r"parent 'nowhere' is no link of the robot; links: .*openarm_body_link0"):
-        PublisherNode(parameter_overrides=[Parameter("cameras", value=str(path))])
+        ros.start(PublisherNode, cameras=str(path))
 
 
 def stored(x: float, seed: int | None, parent: str = "openarm_right_link7") -> StoredCalibration:
@@ -82,9 +80,8 @@ def test_stored_calibrations_are_latched_and_a_change_arrives_without_a_restart(
     """Stored, replaced, damaged (the last good one stays), rolled back."""
     store = CalibrationStore(default_folder())
     store.save(stored(0.10, 3))
-    ros.add(PublisherNode(parameter_overrides=[Parameter("mount_seed", value=3), Parameter("period", value=0.05)]))
-    got: list[TFMessage] = []
-    ros.node.create_subscription(TFMessage, "/tf_static", got.append, QOS_STATIC_TF)
+    ros.start(PublisherNode, mount_seed=3, period=0.05)
+    got = ros.hear(TFMessage, "/tf_static", QOS_STATIC_TF)
 
     def wrist() -> float:
         edge = [e for e in got[-1].transforms if e.child_frame_id == "wrist_link"] if got else []
@@ -105,15 +102,14 @@ def test_stored_calibrations_are_latched_and_a_change_arrives_without_a_restart(
 def test_the_intrinsics_of_the_calibration_in_use_are_latched_and_taken_back_without_a_record(ros) -> None:
     store, optics = CalibrationStore(default_folder()), Intrinsics(640, 480, 600.0, 601.0, 320.0, 240.0)
     store.save(stored(0.10, None).model_copy(update={"intrinsics": optics}))
-    ros.add(PublisherNode(parameter_overrides=[Parameter("period", value=0.05)]))
-    got: dict[str, list[CameraInfo]] = {"wrist": [], "overhead": []}
-    for name, infos in got.items():
-        ros.node.create_subscription(CameraInfo, f"/calibration/{name}/camera_info", infos.append, QOS_LATCHED)
-    ros.spin_until(lambda: all(got.values()), what="camera infos")
-    assert intrinsics_from_info(got["wrist"][-1]) == optics
-    assert got["overhead"][-1].width == 0, "the mount is nominal"
+    ros.start(PublisherNode, period=0.05)
+    wrist = ros.hear(CameraInfo, "/calibration/wrist/camera_info", QOS_LATCHED)
+    overhead = ros.hear(CameraInfo, "/calibration/overhead/camera_info", QOS_LATCHED)
+    ros.spin_until(lambda: wrist and overhead, what="camera infos")
+    assert intrinsics_from_info(wrist[-1]) == optics
+    assert overhead[-1].width == 0, "the mount is nominal"
     store.save(stored(0.11, None))
-    ros.spin_until(lambda: got["wrist"][-1].width == 0, what="a calibration without intrinsics")
+    ros.spin_until(lambda: wrist[-1].width == 0, what="a calibration without intrinsics")
 
 
 @pytest.mark.parametrize("wrong", [stored(0.2, 1), stored(0.2, None, "openarm_left_link7")])
@@ -129,7 +125,7 @@ def test_a_calibration_of_other_mounts_is_refused_and_the_nominal_mount_served(r
 def test_the_suite_s_calibration_of_mount_seed_1_is_served_unless_the_nominal_mounts_are_asked_for(
     ros, nominal: bool
 ) -> None:
-    ros.add(PublisherNode(parameter_overrides=[Parameter("mount_seed", value=1), Parameter("nominal", value=nominal)]))
+    ros.start(PublisherNode, mount_seed=1, nominal=nominal)
     published = edges(ros)
     for name in ("overhead", "wrist"):
         camera = load_cameras()[name]

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
 from openarm_interfaces.srv import SaveTable
-from rclpy.parameter import Parameter
 from tf2_msgs.msg import TFMessage
 
 from openarm_bringup.commands.calibrate_live import table
@@ -60,20 +60,15 @@ class Heights:
         return self.got[-1] if self.got else 0.0
 
 
-def publisher(scene: str, **more) -> PublisherNode:
-    values = {"scene": scene, "period": 0.05, **more}
-    return PublisherNode(parameter_overrides=[Parameter(key, value=value) for key, value in values.items()])
-
-
 @pytest.mark.long
 @pytest.mark.requirement("B-63", "R-15")
 def test_a_table_15_mm_off_is_refused_measured_stored_and_right_for_both_detectors(ros, scene: str) -> None:
     camera = FakeCamera(ros)
     mount = camera.T_base_optical @ se3.inverse(T_LINK_OPTICAL)
     CalibrationStore(default_folder()).save(StoredCalibration.of_mount("overhead", BASE_FRAME, mount))
-    ros.add(publisher(scene))
+    ros.start(PublisherNode, scene=scene, period=0.05)
     heights = Heights(ros)
-    wrist = ros.add(DetectNode(parameter_overrides=[Parameter("camera", value="wrist")], namespace="hand"))
+    wrist = ros.start(partial(DetectNode, namespace="hand"), camera="wrist")
     bench = Bench(ros, camera=camera, mounted=False, scene=scene)
     bench.said("no object is a target: TABLE_MISMATCH: the table is seen at 0.400 m, +15 mm from where it is expected")
     assert bench.detect().detections[0].results[0].pose.covariance[0] == -3.0
@@ -106,7 +101,7 @@ def test_a_table_15_mm_off_is_refused_measured_stored_and_right_for_both_detecto
 
 @pytest.mark.requirement("B-63")
 def test_a_stored_height_outlives_the_node_and_is_not_taken_for_another_table(ros, scene: str) -> None:
-    ros.add(publisher(scene))
+    ros.start(PublisherNode, scene=scene, period=0.05)
     heights, client = Heights(ros), ros.node.create_client(SaveTable, "/calibration_publisher/save_table")
     steep = ros.call(client, SaveTable.Request(height=SEEN, tilt=0.05, method="surface"))
     assert (steep.success, steep.code) == (False, Code.INTRINSICS_MISMATCH)

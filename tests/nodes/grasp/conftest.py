@@ -22,7 +22,6 @@ from openarm_interfaces.srv import ComputeIK, ConfirmPlan, GetScene, Grasp
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
@@ -276,14 +275,11 @@ class Bench:
     def __init__(self, ros, **fakes: bool) -> None:
         self.ros = ros
         self.world: FakeGraph = ros.add(FakeGraph(**fakes))
-        patience = Parameter("limits.ready_timeout", value=60.0)
-        self.node: GraspNode = ros.add(GraspNode(parameter_overrides=[patience]))
-        self.status: list[GraspStatus] = []
-        self.markers: list[MarkerArray] = []
+        self.node: GraspNode = ros.start(GraspNode, limits__ready_timeout=60.0)
         probe = ros.node
         latched = QoSProfile(depth=20, reliability=QOS_LATCHED.reliability, durability=QOS_LATCHED.durability)
-        probe.create_subscription(GraspStatus, "/grasp/status", self.status.append, latched)
-        probe.create_subscription(MarkerArray, "/grasp/markers", self.markers.append, QOS_LATCHED)
+        self.status: list[GraspStatus] = ros.hear(GraspStatus, "/grasp/status", latched)
+        self.markers: list[MarkerArray] = ros.hear(MarkerArray, "/grasp/markers", QOS_LATCHED)
         self.service = probe.create_client(Grasp, "/grasp")
         self.confirm = probe.create_client(ConfirmPlan, "/grasp/confirm")
         self.action = ActionClient(probe, Pick, "/grasp/pick")

@@ -10,7 +10,6 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from openarm_interfaces.action import Pick
 from openarm_interfaces.srv import Grasp
-from rclpy.parameter import Parameter
 from rclpy.task import Future
 from tf2_msgs.msg import TFMessage
 
@@ -27,8 +26,7 @@ from tests.nodes.grasp.conftest import FakeGraph, silence
 @pytest.mark.requirement("B-51", "B-53", "B-71")
 def test_a_grasp_by_service_places_the_object_publishes_its_states_and_moves_hand_and_arm_in_order(bench):
     near: list[int] = []
-    holds: list[DiagnosticStatus] = []
-    bench.ros.node.create_subscription(DiagnosticStatus, "/arm_holds", holds.append, 10)
+    holds = bench.ros.hear(DiagnosticStatus, "/arm_holds")
     bench.until(lambda: bench.ros.node.count_publishers("/arm_holds"), what="the holder")
     bench.world.during = lambda _: near.append(bench.world.count_subscribers("/wrist/detections_3d"))
     answer = bench.ask()
@@ -167,27 +165,25 @@ def test_a_second_request_is_refused_at_once_and_nothing_is_subscribed_that_is_n
 
 @pytest.mark.requirement("B-48")
 def test_a_pregrasp_within_the_path_tolerance_is_refused_at_start(ros):
-    wrong = [Parameter("approach.pregrasp_distance", value=0.05), Parameter("approach.path_tolerance", value=0.04)]
     with pytest.raises(OpenArmError, match="at least twice path_tolerance") as error:
-        GraspNode(parameter_overrides=wrong)
+        ros.start(GraspNode, approach__pregrasp_distance=0.05, approach__path_tolerance=0.04)
     assert error.value.code is Code.CONFIG_INVALID
 
 
 @pytest.mark.requirement("N-19")
 def test_a_state_that_takes_longer_than_its_budget_is_a_warning_in_diagnostics_and_in_the_answer(ros):
     world = ros.add(FakeGraph())
-    budgets = {name: 0.1 if name == "close_gripper" else 600.0 for name in BudgetConfig.model_fields}
-    node = ros.add(GraspNode(parameter_overrides=[Parameter(f"budget.{k}", value=v) for k, v in budgets.items()]))
-    heard: list[DiagnosticStatus] = []
-    ros.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: heard.extend(m.status), 10)
-    service = ros.node.create_client(Grasp, "/grasp")
-    answer = ros.call(service, Grasp.Request(label="red"))
+    budgets = {f"budget.{name}": 600.0 for name in BudgetConfig.model_fields} | {"budget.close_gripper": 0.1}
+    node = ros.start(GraspNode, **budgets)
+    heard = ros.hear(DiagnosticArray, "/diagnostics")
+    answer = ros.call(ros.node.create_client(Grasp, "/grasp"), Grasp.Request(label="red"))
     assert answer.success, answer.message
     late = [one.state for one in answer.state_times if 0.0 < one.budget < one.longest]
     assert late == ["CLOSE_GRIPPER"]
 
     def warned() -> list[str]:
-        return [one.message for one in heard if one.level == DiagnosticStatus.WARN and node.get_name() in one.name]
+        statuses = [one for message in heard for one in message.status if node.get_name() in one.name]
+        return [one.message for one in statuses if one.level == DiagnosticStatus.WARN]
 
     ros.spin_until(lambda: any("CLOSE_GRIPPER" in text for text in warned()), what="the warning")
     assert world.log

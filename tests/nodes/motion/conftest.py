@@ -15,7 +15,6 @@ from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.action.client import ClientGoalHandle
 from rclpy.duration import Duration
-from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
@@ -33,6 +32,7 @@ from openarm_common.ros.convert import (
     trajectory_from_msg,
 )
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF, BaseNode
+from openarm_motion.planning.dual_arm import DualArm
 from openarm_motion.ros.node import MotionNode
 from tests.conftest import own_domain
 
@@ -139,7 +139,7 @@ class Bench:
     #: Rotation of a tool that looks down, its opening along y.
     DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
-    def __init__(self, ros, description: RobotDescription, *, motion: bool = True, **kwargs) -> None:
+    def __init__(self, ros, description: RobotDescription, *, motion: bool = True, **parameters) -> None:
         self.ros, self.description = ros, description
         home = {**description.group_state("left_arm", "home"), **description.group_state("right_arm", "home")}
         fingers = {description.finger_joint("left"): 0.0, description.finger_joint("right"): 0.0}
@@ -152,10 +152,9 @@ class Bench:
         self.apply_client = ros.node.create_client(ApplyScene, "/motion/apply_scene")
         self.get_client = ros.node.create_client(GetScene, "/motion/get_scene")
         self.ik_client = ros.node.create_client(ComputeIK, "/motion/compute_ik")
-        self.markers: list[MarkerArray] = []
-        ros.node.create_subscription(MarkerArray, "/motion/attached_objects", self.markers.append, QOS_LATCHED)
+        self.markers: list[MarkerArray] = ros.hear(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
         if motion:
-            self._add_motion(ros.add(MotionNode(**kwargs)))
+            self._add_motion(ros.start(MotionNode, **parameters))
 
     def _add_motion(self, node: MotionNode) -> None:
         self.node, ros = node, self.ros
@@ -173,6 +172,19 @@ class Bench:
         """Send a goal and return its result."""
         _, future = self.start(client, goal, **kwargs)
         return self.ros.result(future).result
+
+    def done(self, client: ActionClient, goal):
+        """Send a goal that must succeed, and return its result."""
+        result = self.run(client, goal)
+        assert result.success, result.message
+        return result
+
+    def refused(self, client: ActionClient, goal, code: str, text: str = "") -> str:
+        """Send a goal that must fail with a code and a text, and return the message."""
+        result = self.run(client, goal)
+        assert (result.success, result.code) == (False, code), result.message
+        assert text in result.message
+        return result.message
 
     def begin(self, side: str, trajectory: JointTrajectory) -> tuple[ClientGoalHandle, Future]:
         """Send a trajectory and wait until the arm is on its way."""
@@ -202,6 +214,15 @@ class Bench:
     def slow_plan(self, side: str = "right") -> JointTrajectory:
         """A motion that takes long enough to be disturbed."""
         return slower(self.run(self.move_client, self.named(side, plan_only=True)).trajectory)
+
+    def separation(self, *futures: Future) -> float:
+        """Wait for results; the least distance of the arms in the states meanwhile, m."""
+        both = DualArm(*(self.node.service.arms[side] for side in ("left", "right")))
+        seen: list[dict[str, float]] = []
+        ended = lambda: seen.append(dict(self.robot.state)) or all(future.done() for future in futures)  # noqa: E731
+        self.ros.spin_until(ended, what="both arms")
+        scene = both.scene(seen[0])
+        return min(scene.separation(q) for q in np.unique([[s[name] for name in both.names] for s in seen], axis=0))
 
     def q(self, side: str) -> np.ndarray:
         return np.array([self.robot.state[name] for name in self.description.arm_joints(side)])
@@ -244,7 +265,7 @@ def description() -> RobotDescription:
 
 @pytest.fixture
 def make_bench(ros, description: RobotDescription) -> Callable[..., Bench]:
-    """Makes the motion node and its robot; keyword arguments are the node's."""
+    """Makes the motion node and its robot; keyword arguments are the node's parameters."""
     return functools.partial(Bench, ros, description)
 
 
@@ -256,6 +277,4 @@ def bench(make_bench) -> Bench:
 @pytest.fixture
 def moveit_bench(make_bench) -> Bench:
     """With the nodes that answer clients of MoveIt."""
-    return make_bench(
-        parameter_overrides=[Parameter(f"{node}.enabled", value=True) for node in ("move_group", "servo")]
-    )
+    return make_bench(move_group__enabled=True, servo__enabled=True)

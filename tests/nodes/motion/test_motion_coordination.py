@@ -10,7 +10,6 @@ from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox
 
 from openarm_common import se3
 from openarm_common.ros.convert import matrix_to_pose
-from openarm_motion.planning.dual_arm import DualArm
 from tests.nodes.motion.conftest import FASTER, SLOWER, slower
 
 MIDDLE = (0.28, 0.0, 0.60)
@@ -25,27 +24,13 @@ def execute(arm: str, trajectory, max_start_delay: float = 30.0) -> ExecuteTraje
     return ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_start_delay=max_start_delay)
 
 
-def nearest(bench, futures, limit: float = 30.0) -> float:
-    """Wait for results; the least distance of the arms in the states meanwhile."""
-    arms = bench.node.service.arms
-    both = DualArm(arms["left"], arms["right"])
-    seen: list[dict[str, float]] = []
-    done = lambda: seen.append(dict(bench.robot.state)) or all(f.done() for f in futures)  # noqa: E731
-    bench.ros.spin_until(done, limit, "both arms")
-    scene = both.scene(seen[0])
-    states = np.unique([[state[name] for name in both.names] for state in seen], axis=0)
-    return min(scene.separation(q) for q in states)
-
-
 def leaving(bench) -> tuple[object, object]:
     """The left arm is over the middle; how it goes home, slowly, and how the right one goes there, quickly.
 
     From then on the robot's time goes so slowly that a busy machine has planned or cancelled before the way is free.
     """
-    right = bench.run(bench.move_client, to(bench, "right", MIDDLE, plan_only=True))
-    assert right.success, right.message
-    result = bench.run(bench.move_client, to(bench, "left", MIDDLE))
-    assert result.success, result.message
+    right = bench.done(bench.move_client, to(bench, "right", MIDDLE, plan_only=True))
+    bench.done(bench.move_client, to(bench, "left", MIDDLE))
     left = bench.run(bench.move_client, bench.named("left", "home", plan_only=True))
     bench.robot.speed = SLOWER
     return slower(left.trajectory, 5), right.trajectory
@@ -55,13 +40,12 @@ def leaving(bench) -> tuple[object, object]:
 @pytest.mark.requirement("N-12")
 def test_an_arm_rests_until_the_one_under_way_leaves_room(bench) -> None:
     slow, quick = leaving(bench)
-    refused = bench.run(bench.execute_client, execute("right", quick, 0.0))
-    assert refused.code == "IN_COLLISION"
+    bench.refused(bench.execute_client, execute("right", quick, 0.0), "IN_COLLISION")
     _, left = bench.start(bench.execute_client, execute("left", slow))
     _, right = bench.start(bench.execute_client, execute("right", quick))
     bench.under_way("right")
     bench.robot.speed = FASTER
-    gap = nearest(bench, [left, right])
+    gap = bench.separation(left, right)
     first, second = left.result().result, right.result().result
     assert first.success, first.message
     assert second.success, second.message
@@ -89,12 +73,9 @@ def test_an_arm_began_when_its_controller_says_and_holds_after_a_cancel(bench) -
 @pytest.mark.requirement("N-12")
 def test_hands_are_kept_apart_as_if_they_were_open(bench) -> None:
     """The closed hands would stand 41 mm apart; one that opens there would come within 11 mm of the other."""
-    assert bench.run(bench.move_client, to(bench, "left", (0.28, 0.08, 0.60))).success
-    there = bench.run(bench.move_client, to(bench, "right", (0.28, -0.08, 0.68), plan_only=True))
-    assert there.success, there.message
-    refused = bench.run(bench.execute_client, execute("right", there.trajectory))
-    assert refused.code == "IN_COLLISION"
-    assert "finger" in refused.message
+    bench.done(bench.move_client, to(bench, "left", (0.28, 0.08, 0.60)))
+    there = bench.done(bench.move_client, to(bench, "right", (0.28, -0.08, 0.68), plan_only=True))
+    bench.refused(bench.execute_client, execute("right", there.trajectory), "IN_COLLISION", "finger")
 
 
 @pytest.mark.requirement("N-12")
@@ -104,7 +85,7 @@ def test_an_arm_holds_when_the_other_stops_in_its_way(bench) -> None:
     _, right = bench.start(bench.execute_client, execute("right", quick))
     bench.under_way("right")
     handle.cancel_goal_async()
-    gap = nearest(bench, [left, right])
+    gap = bench.separation(left, right)
     assert left.result().result.code == "CANCELLED"
     result = right.result().result
     assert result.code == "IN_COLLISION"
@@ -140,14 +121,13 @@ def test_an_approach_is_planned_around_where_the_other_arm_will_end(bench) -> No
     assert "openarm_left_" in blocked.failure.second
     _, left = bench.start(bench.execute_client, execute("left", slow))
     bench.under_way("left")
-    plan = bench.run(bench.plan_client, approach("right", -0.02))
-    assert plan.success, plan.message
+    plan = bench.done(bench.plan_client, approach("right", -0.02))
     assert 0.0 < plan.start_delay < slow.points[-1].time_from_start.sec + 1.0
     assert not left.done()
     _, right = bench.start(bench.execute_client, execute("right", plan.transfer))
     bench.under_way("right")
     bench.robot.speed = FASTER
-    assert nearest(bench, [left, right]) >= 0.020
+    assert bench.separation(left, right) >= 0.020
     assert right.result().result.success, right.result().result.message
 
 
@@ -159,7 +139,7 @@ def test_an_approach_is_planned_around_where_the_other_arm_will_end(bench) -> No
 def test_what_is_held_stays_so_until_a_request_says_otherwise(bench) -> None:
     plan = bench.run(bench.plan_client, approach("right", -0.24))
     for part in (plan.transfer, plan.approach, plan.retreat):
-        assert bench.run(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=part)).success
+        bench.done(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=part))
     bench.ros.spin_until(lambda: bench.held() == ["right/cube"], what="the cube to be shown as held")
     shelf = CollisionBox(id="shelf", pose=matrix_to_pose(se3.make(None, (0.27, -0.24, 0.465))))
     shelf.size.x, shelf.size.y, shelf.size.z = 0.30, 0.30, 0.01
@@ -170,9 +150,7 @@ def test_what_is_held_stays_so_until_a_request_says_otherwise(bench) -> None:
     assert "with cube in the hand as before (hand_empty: true if it holds nothing any more)" in refused.message
     assert bench.held() == ["right/cube"]
 
-    moved = bench.run(bench.move_client, to(bench, "right", (0.27, -0.20, 0.56)))
-    assert moved.success, moved.message
-    assert "with cube in the hand" in moved.message
+    assert "with cube in the hand" in bench.done(bench.move_client, to(bench, "right", (0.27, -0.20, 0.56))).message
     assert bench.held() == ["right/cube"]
 
     goal.hand_empty = True
@@ -180,9 +158,7 @@ def test_what_is_held_stays_so_until_a_request_says_otherwise(bench) -> None:
     assert bench.held() == ["right/cube"]  # a plan alone forgets nothing
     both = bench.named("right", "home", hand_empty=True)
     both.attached = [CollisionBox(id="cup", pose=matrix_to_pose(np.eye(4)), size=shelf.size)]
-    result = bench.run(bench.move_client, both)
-    assert result.code == "INVALID_ARGUMENT"
-    assert "attached names cup, and hand_empty is true" in result.message
+    bench.refused(bench.move_client, both, "INVALID_ARGUMENT", "attached names cup, and hand_empty is true")
 
     targets = [ArmTarget(arm=side, kind=ArmTarget.NAMED, named="home") for side in ("left", "right")]
     assert bench.run(bench.both_client, MoveArms.Goal(targets=targets, velocity_scale=1.0)).success

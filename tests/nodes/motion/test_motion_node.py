@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -63,46 +64,22 @@ def test_compute_ik_in_the_table_frame_or_what_is_wrong(bench) -> None:
 
 
 def test_refused_moves_say_why(bench) -> None:
+    kinds, home = MoveArm.Goal, partial(MoveArm.Goal, arm="right", kind=MoveArm.Goal.NAMED, named="home")
+    flat = CollisionBox(id="flat", size=Vector3(x=0.1, y=0.1, z=0.0))
     in_table = bench.stamped(se3.make(bench.DOWN, (0.25, -0.25, 0.38)))
     too_far = bench.stamped(se3.make(bench.DOWN, (0.4, 0.2, 0.3)), "table")
     cases = [
         (MoveArm.Goal(arm="left", kind=9), "INVALID_ARGUMENT", "kind is 9"),
         (bench.named(posture="yoga"), "INVALID_ARGUMENT", "no state 'yoga'"),
-        (
-            MoveArm.Goal(arm="right", kind=MoveArm.Goal.JOINTS, joint_positions=[0.0] * 6),
-            "INVALID_ARGUMENT",
-            "goal has 6",
-        ),
-        (
-            MoveArm.Goal(arm="right", kind=MoveArm.Goal.POSE, pose=in_table),
-            "IN_COLLISION",
-            "table",
-        ),
-        (
-            MoveArm.Goal(arm="left", kind=MoveArm.Goal.POSE, pose=too_far),
-            "UNREACHABLE",
-            "nearest reachable pose",
-        ),
-        (
-            MoveArm.Goal(arm="right", kind=3, named="home", velocity_scale=1.5),
-            "INVALID_ARGUMENT",
-            "velocity_scale is 1.5",
-        ),
-        (
-            MoveArm.Goal(arm="right", kind=3, named="home", velocity_scale=1e-9),
-            "INVALID_ARGUMENT",
-            "velocity_scale is 1e-09, expected 0.001 to 1",
-        ),
-        (
-            bench.named(obstacles=[CollisionBox(id="flat", size=Vector3(x=0.1, y=0.1, z=0.0))]),
-            "INVALID_ARGUMENT",
-            "box 'flat' has size",
-        ),
+        (MoveArm.Goal(arm="right", kind=kinds.JOINTS, joint_positions=[0.0] * 6), "INVALID_ARGUMENT", "goal has 6"),
+        (MoveArm.Goal(arm="right", kind=kinds.POSE, pose=in_table), "IN_COLLISION", "table"),
+        (MoveArm.Goal(arm="left", kind=kinds.POSE, pose=too_far), "UNREACHABLE", "nearest reachable pose"),
+        (home(velocity_scale=1.5), "INVALID_ARGUMENT", "velocity_scale is 1.5"),
+        (home(velocity_scale=1e-9), "INVALID_ARGUMENT", "velocity_scale is 1e-09, expected 0.001 to 1"),
+        (bench.named(obstacles=[flat]), "INVALID_ARGUMENT", "box 'flat' has size"),
     ]
     for goal, code, text in cases:
-        result = bench.run(bench.move_client, goal)
-        assert (result.success, result.code) == (False, code), result.message
-        assert text in result.message
+        bench.refused(bench.move_client, goal, code, text)
 
 
 # --- approaches
@@ -126,8 +103,7 @@ def test_a_grasp_is_planned_executed_and_shown_as_attached_b47(bench) -> None:
     assert 0.05 <= near < 1.6  # the limit margin of the planner, and less than half of the narrowest joint's range
     assert plan.planning_time > 0.0
     for part, held in ((plan.transfer, []), (plan.approach, []), (plan.retreat, ["right/cube"])):
-        result = bench.run(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=part))
-        assert result.success, result.message
+        bench.done(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=part))
         bench.ros.spin_until(lambda held=held: bench.held() == held, what=f"{held} shown as attached")
     marker = bench.markers[-1].markers[-1]
     assert marker.header.frame_id == "openarm_right_hand_tcp"
@@ -233,18 +209,10 @@ def test_an_arm_that_a_client_holds_moves_for_that_client_alone_and_its_controll
     holder.hold("right")
     key = bytes(holder.goal_id().uuid[:8])
     bench.ros.spin_until(lambda: bytes(bench.node._holds.goal_id("right").uuid[:8]) == key, what="the hold")
-    for client, goal in (
-        (bench.move_client, bench.named("right")),
-        (
-            bench.both_client,
-            MoveArms.Goal(
-                targets=[ArmTarget(arm=arm, kind=ArmTarget.NAMED, named="home") for arm in ("left", "right")]
-            ),
-        ),
-    ):
-        refused = bench.run(client, goal)
-        assert (refused.success, refused.code) == (False, "BUSY"), refused.message
-        assert refused.message.startswith("the right arm is held by the grasp node (a grasp of 'red')")
+    both = MoveArms.Goal(targets=[ArmTarget(arm=arm, kind=ArmTarget.NAMED, named="home") for arm in ("left", "right")])
+    for client, goal in ((bench.move_client, bench.named("right")), (bench.both_client, both)):
+        message = bench.refused(client, goal, "BUSY")
+        assert message.startswith("the right arm is held by the grasp node (a grasp of 'red')")
     assert bench.run(bench.move_client, bench.named("right", plan_only=True)).success
     assert bench.run(bench.move_client, bench.named("left", "home")).success
     assert bench.run(bench.move_client, bench.named("right", "home"), goal_uuid=holder.goal_id()).success

@@ -114,18 +114,12 @@ class Client:
 
 
 @pytest.fixture
-def bench(moveit_bench):
-    return moveit_bench
-
-
-@pytest.fixture
-def client(bench) -> Client:
-    return Client(bench)
+def client(moveit_bench) -> Client:
+    return Client(moveit_bench)
 
 
 def test_a_joint_goal_is_planned_shown_and_executed(client: Client) -> None:
-    shown: list[DisplayTrajectory] = []
-    client.node.create_subscription(DisplayTrajectory, "/display_planned_path", shown.append, QOS_LATCHED)
+    shown = client.ros.hear(DisplayTrajectory, "/display_planned_path", QOS_LATCHED)
     goal = client.named()
 
     answer = client.plan(client.joint_goal(goal))

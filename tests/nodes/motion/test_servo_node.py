@@ -22,13 +22,11 @@ class Client:
     def __init__(self, bench, prefix: str = "") -> None:
         self.bench, self.ros, self.node = bench, bench.ros, bench.ros.node
         self.name = f"{prefix}/servo_node"
-        self.said: list[ServoStatus] = []
-        self.sent: list[JointTrajectory] = []
         self.twists = self.node.create_publisher(TwistStamped, f"{self.name}/delta_twist_cmds", 10)
         self.jogs = self.node.create_publisher(JointJog, f"{self.name}/delta_joint_cmds", 10)
-        self.node.create_subscription(ServoStatus, f"{self.name}/status", self.said.append, 10)
+        self.said: list[ServoStatus] = self.ros.hear(ServoStatus, f"{self.name}/status")
         topic = "/right_joint_trajectory_controller/joint_trajectory"
-        self.node.create_subscription(JointTrajectory, topic, self.sent.append, 10)
+        self.sent: list[JointTrajectory] = self.ros.hear(JointTrajectory, topic)
 
     def call(self, kind, name: str, request=None):
         return self.ros.call(self.node.create_client(kind, f"{self.name}/{name}"), request or kind.Request())
@@ -61,13 +59,8 @@ def twist(frame: str = "", z: float = 0.1) -> TwistStamped:
 
 
 @pytest.fixture
-def bench(moveit_bench):
-    return moveit_bench
-
-
-@pytest.fixture
-def client(bench) -> Client:
-    return Client(bench)
+def client(moveit_bench) -> Client:
+    return Client(moveit_bench)
 
 
 def test_commands_are_refused_before_start_and_after_stop(client: Client) -> None:
@@ -108,8 +101,8 @@ def test_a_command_that_makes_no_sense_is_refused_by_name_and_one_of_another_typ
     client.send(message, lambda: any("switch_command_type" in one for one in client.refusals()))
 
 
-def test_an_unknown_frame_is_refused_on_the_topic_of_an_arm(bench) -> None:
-    client = Client(bench, "/right")
+def test_an_unknown_frame_is_refused_on_the_topic_of_an_arm(moveit_bench) -> None:
+    client = Client(moveit_bench, "/right")
     assert client.call(Trigger, "start_servo").success
     assert "nowhere" in client.refusal(twist("nowhere"))
 
