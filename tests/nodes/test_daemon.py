@@ -31,6 +31,7 @@ from openarm_bringup.supervision.state import socket_path
 from openarm_common.domain import release_domain, reserve_domain
 from openarm_common.ros.client import BackgroundNode, new_context
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED
+from tests.openarm_bringup.commands import record_of
 
 pytestmark = pytest.mark.requirement("R-26")
 ROOT = Path(__file__).parents[2]
@@ -54,24 +55,12 @@ class Graph:
         self.silent = node.create_publisher(String, "/silent", QOS_COMMAND)
         node.create_timer(0.02, lambda: self.ticks.publish(String(data="tick")))
         node.create_service(SetPause, "/pause", self._pause)
-        me = psutil.Process()
         ready = runs.NodeRecord(state="ready")
-        runs.write_record(
-            runs.RunRecord(
-                graph="toy",
-                pid=me.pid,
-                pid_created=me.create_time(),
-                domain=domain,
-                discovery="localhost",
-                run_dir=str(run_dir),
-                started="2026-01-01",
-                ready=True,
-                nodes={"probe": ready},
-            )
-        )
+        runs.write_record(record_of("toy", domain, {"probe": ready}, run_dir=str(run_dir), ready=True))
+        path = socket_path(os.getpid())
         self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
-        self.listener.bind(str(socket_path(me.pid)))
-        socket_path(me.pid).chmod(0o600)
+        self.listener.bind(str(path))
+        path.chmod(0o600)
         self.listener.listen(32)
         self.env = {**os.environ, "PYTHONPATH": str(ROOT)}
         fd = self.listener.fileno()

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
-from openarm_bringup import cli
 from openarm_calibration.foreign.optics import read_camera_info
 from openarm_calibration.store.store import CalibrationStore, StoredCalibration
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
 from openarm_common.robot.description import RobotDescription
+from tests.openarm_bringup.commands import calibrate
 
 T = se3.make(se3.exp_so3((0.3, -1.1, 2.0)), (0.0412, -0.033, 0.0871))
 K = Intrinsics(1280, 720, 911.5, 909.25, 640.2, 358.75)
@@ -30,14 +30,8 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CalibrationStore:
     return made
 
 
-def export(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
-    code = cli.run(["calibrate", "export", *argv])
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
 def written(capsys, path: Path, *argv: str) -> str:
-    code, _, err = export(capsys, *argv, "--out", str(path))
+    code, _, err = calibrate(capsys, "export", *argv, "--out", str(path))
     assert code == 0, err
     return path.read_text()
 
@@ -56,7 +50,7 @@ def test_easy_handeye2_places_the_optical_frame(capsys, store, tmp_path: Path) -
 
 @pytest.mark.requirement("P-28")
 def test_a_launch_file_with_the_line_publishes_the_mount(capsys, store) -> None:
-    code, out, _ = export(capsys, "--format", "static_transform", "--camera", "wrist")
+    code, out, _ = calibrate(capsys, "export", "--format", "static_transform", "--camera", "wrist")
     assert code == 0
     node = ElementTree.fromstring(next(line for line in out.splitlines() if line.startswith("<node")))
     words = shlex.split(node.get("args"))
@@ -104,14 +98,14 @@ def test_camera_info_has_all_fields_and_the_intrinsics(capsys, store, tmp_path: 
 )
 def test_wrong_calls(capsys, store, tmp_path, monkeypatch, argv: list[str], code: int, words: str) -> None:
     monkeypatch.chdir(tmp_path)
-    got, _, err = export(capsys, *argv)
+    got, _, err = calibrate(capsys, "export", *argv)
     assert got == code, err
     assert words in err
 
 
 def test_a_calibration_of_pose_pairs_has_no_camera_info(capsys, store) -> None:
     store.save(StoredCalibration.of_mount("side", "base", T))
-    assert export(capsys, "--format", "camera_info", "--camera", "side")[0] == 2
-    code, _, err = export(capsys, "--format", "urdf")
+    assert calibrate(capsys, "export", "--format", "camera_info", "--camera", "side")[0] == 2
+    code, _, err = calibrate(capsys, "export", "--format", "urdf")
     assert code == 2
     assert "2 calibrations" in err

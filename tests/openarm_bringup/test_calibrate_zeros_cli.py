@@ -3,20 +3,19 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from openarm_bringup import cli
 from openarm_bringup.supervision.environment import client_environment
 from openarm_bringup.supervision.graph import load_graph
 from openarm_calibration.handeye import zero_sets
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.zeros import ZEROS, zeros_label
+from tests.openarm_bringup.commands import answer_of
 from tests.openarm_calibration.known_session import make_session
 
 #: Degrees by joint of each arm.
@@ -50,12 +49,6 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "store"
 
 
-def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict]:
-    code = cli.run(["calibrate", *argv, "--json"])
-    out, _ = capsys.readouterr()
-    return code, json.loads(out)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("count", "folds"), [(8, 2), (14, 5)])
 @pytest.mark.requirement("R-11")
@@ -64,7 +57,7 @@ def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_bac
 ) -> None:
     monkeypatch.setattr(zero_sets, "_FOLDS", folds)
     page, taken = tmp_path / "zeros.html", sessions(tmp_path, count)
-    code, answer = run(capsys, "zeros", *taken, "--save", "--page", str(page))
+    code, answer = answer_of(capsys, "calibrate", "zeros", *taken, "--save", "--page", str(page))
     assert code == 0, answer["message"]
     text = page.read_text()
     data, truth = answer, zeros_of_both()
@@ -79,7 +72,7 @@ def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_bac
     assert all(mount["zeros"] == zeros_label(zeros["offsets"]) for mount in data["mounts"].values())
 
     # a later solve of one session, at the stored zeros, passes; nothing but the command line says so
-    code, solved = run(capsys, "solve", taken[-1])
+    code, solved = answer_of(capsys, "calibrate", "solve", taken[-1])
     assert solved["figures"]["robot_rotation"] < math.radians(0.02)
 
     # a graph of the real robot gives all its nodes the zeros; a simulated robot has its own, which nobody stored
@@ -102,13 +95,13 @@ def test_zeros_are_found_stored_read_by_graphs_and_later_commands_and_rolled_bac
     simulated = client_environment(load_graph("sim"), tmp_path / "other")[ZEROS]
     assert Path(simulated).stem == "simulated_openarm"
 
-    code, listed = run(capsys, "list")
+    code, listed = answer_of(capsys, "calibrate", "list")
     assert set(listed["zeros"]) == {"zeros"}
     # a run that has begun keeps its zeros
-    assert run(capsys, "rollback", "zeros")[0] == 0
+    assert answer_of(capsys, "calibrate", "rollback", "zeros")[0] == 0
     assert client_environment(load_graph("real"), tmp_path / "run")[ZEROS] == environment[ZEROS]
-    assert run(capsys, "list")[1]["zeros"]["zeros"]["offsets"] == {}
-    code, answer = run(capsys, "rollback", "zeros")
+    assert answer_of(capsys, "calibrate", "list")[1]["zeros"]["zeros"]["offsets"] == {}
+    code, answer = answer_of(capsys, "calibrate", "rollback", "zeros")
     assert code == 1
     assert "going back needs" in answer["message"]
 
@@ -121,7 +114,7 @@ def test_zeros_that_are_right_are_left_alone_and_nothing_is_stored(
     monkeypatch.setattr(zero_sets, "_FOLDS", 2)
     path = tmp_path / "exact.npz"
     make_session("to_hand", 10, spread=0.5).samples.save(path)
-    code, answer = run(capsys, "zeros", str(path), "--save")
+    code, answer = answer_of(capsys, "calibrate", "zeros", str(path), "--save")
     assert code == 1
     assert "nothing was stored" in answer["message"]
     assert not store.exists()
@@ -139,6 +132,6 @@ def test_zeros_that_are_right_are_left_alone_and_nothing_is_stored(
 )
 def test_wrong_priors_are_refused_with_what_is_valid(capsys, tmp_path: Path, argv: list[str], part: str) -> None:
     make_session(count=3).samples.save(tmp_path / "three.npz")
-    code, answer = run(capsys, "zeros", str(tmp_path / "three.npz"), *argv)
+    code, answer = answer_of(capsys, "calibrate", "zeros", str(tmp_path / "three.npz"), *argv)
     assert code != 0
     assert part in answer["message"]

@@ -20,6 +20,7 @@ from openarm_bringup.outcome import Outcome
 from openarm_bringup.supervision import runs, session
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.campaign.options import parse_seeds
+from tests.openarm_bringup.commands import answer_of, record_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,9 +33,10 @@ def own_folders(own_state: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def record(process: psutil.Process, graph: str, domain: int, nodes: dict[str, runs.NodeRecord], **more) -> Path:
     """Write the record of a supervisor."""
-    about = {"pid": process.pid, "pid_created": process.create_time(), "discovery": "localhost"}
-    about |= {"run_dir": "", "started": f"2026-01-01T00:00:0{domain % 10}", "ready": True}
-    return runs.write_record(runs.RunRecord(graph=graph, domain=domain, nodes=nodes, **(about | more)))
+    about = {"pid": process.pid, "pid_created": process.create_time(), "ready": True}
+    return runs.write_record(
+        record_of(graph, domain, nodes, started=f"2026-01-01T00:00:0{domain % 10}", **(about | more))
+    )
 
 
 @pytest.mark.parametrize(
@@ -81,10 +83,8 @@ def test_wrong_call_ends_with_2_and_one_sentence(
 
 
 def test_refused_call_is_json_too(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["up", "no_such_graph", "--json"]) == 2
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["success"] is False
-    assert answer["code"] == "INVALID_ARGUMENT"
+    code, answer = answer_of(capsys, "up", "no_such_graph")
+    assert (code, answer["success"], answer["code"]) == (2, False, "INVALID_ARGUMENT")
 
 
 @pytest.mark.parametrize(
@@ -165,8 +165,8 @@ def test_up_warns_that_the_network_can_move_the_arms_before_it_starts_anything(
 
 
 def test_ps_and_logs_find_a_running_graph(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["ps", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["graphs"] == []
+    code, answer = answer_of(capsys, "ps")
+    assert (code, answer["graphs"]) == (0, [])
     me = psutil.Process()
     folder = runs.new_run_dir()
     (folder / "logs" / "arm.log").write_text("one\ntwo\nthree\n")
@@ -222,9 +222,8 @@ def test_a_graph_is_not_started_next_to_another_that_has_its_nodes(capsys: pytes
     ready = runs.NodeRecord(state="ready")
     record(psutil.Process(other.pid), "arms", 67, {"motion": ready, "eye": ready})
     try:
-        assert cli.run(["up", "motion", "--domain", "67", "--json"]) == 1
-        answer = json.loads(capsys.readouterr().out)
-        assert answer["code"] == Code.BUSY
+        code, answer = answer_of(capsys, "up", "motion", "--domain", "67")
+        assert (code, answer["code"]) == (1, Code.BUSY)
         assert f"arms (supervisor {other.pid}) runs in domain 67 and has motion already" in answer["message"]
         runs.refuse_twins(67, ["hand"])  # as with eyes and hands under supervisors of their own
         runs.refuse_twins(68, ["motion"])

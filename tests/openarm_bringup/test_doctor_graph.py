@@ -7,6 +7,7 @@ import pytest
 
 from openarm_bringup.doctor.graph import GraphStatus, check_nodes, check_status
 from openarm_bringup.supervision.runs import NodeRecord, RunRecord
+from tests.openarm_bringup.commands import record_of
 
 NODES = {name: NodeRecord(state="ready") for name in ("mujoco_bridge", "detector", "grasp")}
 WELL = {name: (True, "fine") for name in NODES}
@@ -14,16 +15,7 @@ RATES = {"/joint_states": 99.8, "/clock": 100.1, "/tf": 50.0}
 
 
 def run(**nodes: NodeRecord) -> RunRecord:
-    return RunRecord(
-        graph="sim",
-        pid=1,
-        pid_created=0.0,
-        domain=7,
-        discovery="localhost",
-        run_dir="",
-        started="",
-        nodes={**NODES, **nodes},
-    )
+    return record_of("sim", 7, {**NODES, **nodes})
 
 
 def test_a_sound_graph_is_ok_throughout() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import textwrap
 import time
 from collections.abc import Callable
@@ -18,9 +17,7 @@ from openarm_bringup.supervision import process
 from openarm_bringup.supervision.graph import NodeSpec, Ready, Restart
 from openarm_bringup.supervision.keeper import NodeState
 from tests.conftest import DEADLINE_S
-
-sys.path.insert(0, str(Path(__file__).parent))
-from test_supervisor import Running, gone, in_loop, running
+from tests.openarm_bringup.test_supervisor import Running, gone, in_loop, running
 
 pytestmark = pytest.mark.usefixtures("own_state")
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import cv2
@@ -14,6 +13,7 @@ from openarm_bringup import cli
 from openarm_common.camera.cameras import Intrinsics
 from openarm_perception.frames.pcd import OrganisedCloud, read_pcd, write_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
+from tests.openarm_bringup.commands import answer_of
 
 pytestmark = pytest.mark.requirement("R-19")
 
@@ -39,23 +39,18 @@ def files(tmp_path: Path) -> tuple[str, ...]:
     return str(tmp_path / "c.png"), str(tmp_path / "z.png"), "--info", str(tmp_path / "k.yaml")
 
 
-def call(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict[str, object]]:
-    code = cli.run(["perceive", *argv, "--json"])
-    return code, json.loads(capsys.readouterr().out)
-
-
 def test_a_box_is_found_measured_and_drawn(files, tmp_path, capsys):
     out = tmp_path / "a" / "out"
-    code, answer = call(capsys, *files, "--depth-scale", "0.0001", "--out", str(out))
+    code, answer = answer_of(capsys, "perceive", *files, "--depth-scale", "0.0001", "--out", str(out))
     assert (code, answer["success"], answer["frame"]) == (0, True, "camera")
-    (one,) = answer["clusters"]  # type: ignore[misc]
+    (one,) = answer["clusters"]
     assert (one["shape"], one["color"], one["cut"]) == ("box", "red", "")
     assert one["size"] == pytest.approx([0.06, 0.08, 0.05], abs=0.005)  # a pixel
     assert one["centre"] == pytest.approx([0.0, 0.0, DISTANCE - HEIGHT / 2], abs=0.003)
-    (detection,) = answer["detections"]  # type: ignore[misc]
+    (detection,) = answer["detections"]
     assert (detection["label"], detection["cluster"]) == ("red", 1)
     names = ("overlay.png", "labels.png", "label.png", "depth.png", "color.png", "index.html")
-    assert sorted(Path(path).name for path in answer["written"]) == sorted(names)  # type: ignore[union-attr]
+    assert sorted(Path(path).name for path in answer["written"]) == sorted(names)
     label = cv2.imread(str(out / "label.png"), cv2.IMREAD_UNCHANGED)
     assert label.dtype == np.uint16
     assert np.count_nonzero(label) == one["pixels"]
@@ -70,10 +65,10 @@ def test_a_table_is_printed(files, capsys):
 
 
 def test_a_cloud_gives_the_same(files, tmp_path, capsys):
-    _, of_images = call(capsys, *files, "--depth-scale", "0.0001")
-    code, answer = call(capsys, str(tmp_path / "a.pcd"))
+    _, of_images = answer_of(capsys, "perceive", *files, "--depth-scale", "0.0001")
+    code, answer = answer_of(capsys, "perceive", str(tmp_path / "a.pcd"))
     assert code == 0
-    (a,), (b,) = of_images["clusters"], answer["clusters"]  # type: ignore[misc]
+    (a,), (b,) = of_images["clusters"], answer["clusters"]
     assert b["size"] == pytest.approx(a["size"], abs=5e-4)
     assert b["centre"] == pytest.approx(a["centre"], abs=5e-4)
 
@@ -81,10 +76,10 @@ def test_a_cloud_gives_the_same(files, tmp_path, capsys):
 def test_a_pose_gives_the_base_frame_and_a_background_what_is_new(files, tmp_path, capsys):
     (tmp_path / "pose.txt").write_text("1 0 0 0.3\n0 -1 0 0\n0 0 -1 1.1\n0 0 0 1\n")
     pose = ("--depth-scale", "0.0001", "--pose", str(tmp_path / "pose.txt"))
-    _, answer = call(capsys, *files, *pose)
+    _, answer = answer_of(capsys, "perceive", *files, *pose)
     assert answer["frame"] == "base"
-    assert answer["clusters"][0]["centre"] == pytest.approx([0.3, 0.0, 0.425], abs=0.003)  # type: ignore[index]
-    code, answer = call(capsys, *files, *pose, "--background", files[1])
+    assert answer["clusters"][0]["centre"] == pytest.approx([0.3, 0.0, 0.425], abs=0.003)
+    code, answer = answer_of(capsys, "perceive", *files, *pose, "--background", files[1])
     assert (code, answer["clusters"]) == (0, [])
 
 
@@ -106,12 +101,12 @@ def test_a_pose_gives_the_base_frame_and_a_background_what_is_new(files, tmp_pat
 )
 def test_what_is_wrong_is_said_in_a_sentence(files, tmp_path, capsys, argv, exit_code, words):
     names = {"c": files[0], "z": files[1], "k": files[3], "p": str(tmp_path / "a.pcd")}
-    code, answer = call(capsys, *(each.format(**names) for each in argv))
+    code, answer = answer_of(capsys, "perceive", *(each.format(**names) for each in argv))
     assert (code, answer["success"]) == (exit_code, False)
     assert words in str(answer["message"])
 
 
 def test_the_cloud_is_left_as_it_is(files, tmp_path, capsys):
     before = read_pcd(tmp_path / "a.pcd").points.copy()
-    call(capsys, str(tmp_path / "a.pcd"), "--far", "0.68")
+    answer_of(capsys, "perceive", str(tmp_path / "a.pcd"), "--far", "0.68")
     assert np.array_equal(read_pcd(tmp_path / "a.pcd").points, before)

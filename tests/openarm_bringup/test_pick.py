@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 from openarm_interfaces.msg import GraspStatus
 
@@ -17,6 +16,7 @@ from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import Option
 from openarm_grasp.ros.client import GraspResult
+from tests.openarm_bringup.commands import record_of
 
 OPTIONS = (
     Option("red/x+/tilt0", "left", 0.05, {"tilt": -0.0, "width": 0.05}, 0.5, Code.OK, "chosen"),
@@ -41,21 +41,9 @@ def test_a_graph_without_grasping_is_named_with_one_that_has_it(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
-    me = psutil.Process()
 
     def run(*nodes: str) -> None:
-        states = {node: runs.NodeRecord(state="ready") for node in nodes}
-        record = runs.RunRecord(
-            graph="motion",
-            pid=me.pid,
-            pid_created=me.create_time(),
-            domain=7,
-            discovery="localhost",
-            run_dir="",
-            started="",
-            nodes=states,
-        )
-        runs.write_record(record)
+        runs.write_record(record_of("motion", 7, {node: runs.NodeRecord(state="ready") for node in nodes}))
 
     def ask() -> str:
         with pytest.raises(OpenArmError) as refused, connect.requires_node("grasp", "sim"):
@@ -101,6 +89,15 @@ class Client:
         return GraspResult(True, Code.OK, "done", "SUCCESS", "red", "right", 1, (0.0, 0.0, 0.4), 1.0)
 
 
+@pytest.fixture
+def client(monkeypatch: pytest.MonkeyPatch) -> Client:
+    """What commands ask in place of the grasp node."""
+    made = Client()
+    monkeypatch.setattr("openarm_grasp.ros.client.GraspClient", lambda: made)
+    monkeypatch.setattr(pick, "join_graph", lambda domain: None)
+    return made
+
+
 class Stdin(io.StringIO):
     def __init__(self, text: str, *, terminal: bool) -> None:
         super().__init__(text)
@@ -112,11 +109,8 @@ class Stdin(io.StringIO):
     ("typed", "accepted"), [("y\n", True), ("YES\n", True), ("\n", False), ("n\n", False), ("", False)]
 )
 def test_a_plan_is_shown_on_the_terminal_and_confirmed_by_yes_alone(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], typed: str, accepted: bool
+    client: Client, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], typed: str, accepted: bool
 ) -> None:
-    client = Client()
-    monkeypatch.setattr("openarm_grasp.ros.client.GraspClient", lambda: client)
-    monkeypatch.setattr(pick, "join_graph", lambda domain: None)
     monkeypatch.setattr("sys.stdin", Stdin(typed, terminal=True))
     assert pick.pick("red", confirm=True).success
     assert client.accepted is accepted
@@ -126,11 +120,8 @@ def test_a_plan_is_shown_on_the_terminal_and_confirmed_by_yes_alone(
 
 @pytest.mark.requirement("P-20", "R-25")
 def test_without_a_terminal_a_plan_waits_for_the_service(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    client: Client, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    client = Client()
-    monkeypatch.setattr("openarm_grasp.ros.client.GraspClient", lambda: client)
-    monkeypatch.setattr(pick, "join_graph", lambda domain: None)
     monkeypatch.setattr("sys.stdin", Stdin("y\n", terminal=False))
     pick.pick("red", confirm=True)
     assert client.asked["confirm"] is True
@@ -143,7 +134,7 @@ def test_without_a_terminal_a_plan_waits_for_the_service(
 
 @pytest.mark.requirement("R-17", "P-02", "P-03")
 def test_an_order_lists_what_is_left_with_place_and_reason(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    client: Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     answers = [
         GraspResult(True, Code.OK, "placed", "SUCCESS", "cup", "left", 1, (0.2, 0.3, 0.4), 9.0, (0.3, 0.0, 0.42)),
@@ -152,13 +143,11 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     ]
     asked: list[dict[str, Any]] = []
 
-    class Ordered(Client):
-        def pick(self, label: str, **more: Any) -> GraspResult:
-            asked.append({"label": label, **more})
-            return answers.pop(0)
+    def answer(label: str, **more: Any) -> GraspResult:
+        asked.append({"label": label, **more})
+        return answers.pop(0)
 
-    monkeypatch.setattr("openarm_grasp.ros.client.GraspClient", Ordered)
-    monkeypatch.setattr(pick, "join_graph", lambda domain: None)
+    monkeypatch.setattr(client, "pick", answer)
     bins = tmp_path / "bins.yaml"
     bins.write_text("bins: {tray: {x: [0.15, 0.25], y: [0.2, 0.44]}}\nrest: tray\n")
     outcome = pick.order("anything", bins=bins)

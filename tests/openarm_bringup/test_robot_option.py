@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ from openarm_bringup.commands import connect, doctor
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.folder import ROBOT, per_robot, robot_name
+from tests.openarm_bringup.commands import answer_of, record_of
 
 DOMAIN = 61
 
@@ -36,15 +36,11 @@ def environment(monkeypatch, tmp_path):
 @pytest.fixture
 def running(nearer) -> Iterator[runs.RunRecord]:
     """The record of a graph of another robot than this process's."""
-    me = psutil.Process()
-    record = runs.RunRecord(
-        graph="sim", robot=nearer, pid=me.pid, pid_created=me.create_time(), domain=DOMAIN, discovery="localhost",
-        run_dir="", started="", nodes={},
-    )  # fmt: skip
+    record = record_of("sim", DOMAIN, robot=nearer)
     runs.write_record(record)
     os.environ[ROBOT] = "openarm_v1"
     yield record
-    runs.remove_record(me.pid)
+    runs.remove_record(record.pid)
 
 
 @pytest.mark.parametrize("command", [["up"], ["campaign"], ["demo"], ["chaos"], ["model", "urdf"]])
@@ -56,8 +52,8 @@ def test_a_robot_that_is_not_there_is_refused_with_those_that_are(command, capsy
 
 def test_a_command_works_with_the_robot_that_is_named(nearer, monkeypatch, capsys):
     monkeypatch.setenv(ROBOT, "openarm_v1")
-    assert cli.run(["model", "srdf", "--robot", nearer, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["robot"] == nearer
+    code, answer = answer_of(capsys, "model", "srdf", "--robot", nearer)
+    assert (code, answer["robot"]) == (0, nearer)
     assert os.environ[ROBOT] == nearer  # and so do the processes that it starts
 
 

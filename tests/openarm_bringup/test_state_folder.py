@@ -11,6 +11,7 @@ import pytest
 from openarm_bringup.supervision import runs
 from openarm_bringup.supervision.state import state_dir
 from openarm_common.errors import Code, OpenArmError
+from tests.openarm_bringup.commands import record_of
 
 
 @pytest.fixture
@@ -19,23 +20,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return state_dir()
 
 
-def record() -> runs.RunRecord:
-    return runs.RunRecord(
-        graph="sim",
-        pid=os.getpid(),
-        pid_created=0.0,
-        domain=7,
-        discovery="localhost",
-        run_dir="/",
-        started="2026-01-01",
-        ready=True,
-        nodes={},
-    )
-
-
 def test_a_folder_of_this_user_is_made_and_used(folder: Path) -> None:
     assert runs.running() == []
-    runs.write_record(record())
+    runs.write_record(record_of("sim", 7))
     assert folder.stat().st_mode & 0o777 == 0o700
     runs.remove_record(os.getpid())
 
@@ -50,7 +37,7 @@ def test_a_folder_that_another_user_may_have_made_is_refused_by_name(
         folder.symlink_to(folder.parent / "elsewhere")
     else:
         folder.mkdir(mode=0o700)
-        (folder / "1.json").write_text(record().model_dump_json())
+        (folder / "1.json").write_text(record_of("sim", 7).model_dump_json())
     if fault == "writable":
         folder.chmod(0o777)
     elif fault == "other_owner":
@@ -60,4 +47,4 @@ def test_a_folder_that_another_user_may_have_made_is_refused_by_name(
         runs.running()
     assert caught.value.code is Code.ENVIRONMENT
     with pytest.raises(PermissionError):
-        runs.write_record(record())
+        runs.write_record(record_of("sim", 7))

@@ -218,7 +218,8 @@ async def test_a_full_run_folder_holds_no_node_up_and_nothing_is_left_after_the_
     assert runs.running() == []
 
 
-def test_a_node_that_was_killed_comes_back_without_its_ports_and_old_endpoints_do_not_count_as_ready(
+@in_loop
+async def test_a_node_that_was_killed_comes_back_without_its_ports_and_old_endpoints_do_not_count_as_ready(
     tmp_path: Path,
 ) -> None:
     """Others would go on writing into the shared memory that has the numbers of the ports."""
@@ -235,21 +236,17 @@ time.sleep(60)
     spec = toy(tmp_path, "arm", restart=Restart(backoff=0.05))
     command = ("python", "-S", "-c", f"import os, pathlib, sys{take}", str(tmp_path / "arm"))
     port = tmp_path / "arm.port"
-
-    async def body() -> None:
-        async with running(tmp_path, {"arm": spec.model_copy(update={"command": command})}) as run:
-            await run.supervisor.wait_ready()
-            first, killed = int(port.read_text()), run.supervisor.pid("arm")
-            os.kill(killed, signal.SIGKILL)
-            await run.until(lambda: run.seen("arm").count(NodeState.READY) == 2)
-            assert (tmp_path / "arm").read_text() == str(run.supervisor.pid("arm")) != str(killed)
-            assert int(port.read_text()) != first
-            back = [NodeState.STARTING, NodeState.READY]
-            assert run.seen("arm") == [*back, NodeState.BACKOFF, *back]
-        with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as one:
-            one.bind(("", first))  # released at the end
-
-    asyncio.run(body())
+    async with running(tmp_path, {"arm": spec.model_copy(update={"command": command})}) as run:
+        await run.supervisor.wait_ready()
+        first, killed = int(port.read_text()), run.supervisor.pid("arm")
+        os.kill(killed, signal.SIGKILL)
+        await run.until(lambda: run.seen("arm").count(NodeState.READY) == 2)
+        assert (tmp_path / "arm").read_text() == str(run.supervisor.pid("arm")) != str(killed)
+        assert int(port.read_text()) != first
+        back = [NodeState.STARTING, NodeState.READY]
+        assert run.seen("arm") == [*back, NodeState.BACKOFF, *back]
+    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as one:
+        one.bind(("", first))  # released at the end
 
 
 @in_loop
