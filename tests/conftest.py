@@ -25,6 +25,7 @@ import yaml
 from openarm_common.domain import release_domain, reserve_domain
 from openarm_common.resources import models_dir
 from openarm_common.robot import folder, zeros
+from openarm_common.robot.description import RobotDescription
 
 # Before any rclpy is imported: a domain of this process, no traffic beyond this machine, software rendering.
 os.environ["ROS_DOMAIN_ID"] = str(reserve_domain())
@@ -222,6 +223,12 @@ class RosProbe:
             if hasattr(node, "close"):
                 node.close()
             node.destroy_node()
+
+
+@pytest.fixture(scope="module")
+def description() -> RobotDescription:
+    """The default robot."""
+    return RobotDescription.load()
 
 
 @contextmanager

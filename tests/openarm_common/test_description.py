@@ -69,11 +69,6 @@ def closed_form_tcp(q: Array) -> Array:
 
 
 @pytest.fixture(scope="module")
-def description() -> RobotDescription:
-    return RobotDescription.load()
-
-
-@pytest.fixture(scope="module")
 def model(description: RobotDescription) -> mujoco.MjModel:
     return robot_spec(description, PhysicsConfig()).compile()
 

@@ -16,11 +16,6 @@ MINI = """<robot name="mini"><link name="base"/><link name="slide"/>
     <limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
 
 
-@pytest.fixture(scope="module")
-def description() -> RobotDescription:
-    return RobotDescription.load()
-
-
 @pytest.mark.parametrize("group", ["left_arm", "right_arm", "both_arms", "left_gripper", "right_gripper"])
 def test_srdf_states_cover_their_group_within_limits(description: RobotDescription, group: str) -> None:
     side, part = group.split("_")

@@ -119,6 +119,16 @@ class Bench:
         self.until([Phase.FOLLOWING, Phase.FOLLOWING], 3.0)
         return self
 
+    def repair(self, seconds: float) -> None:
+        """End all faults, reset the machine, and give the arms time to come up."""
+        self.buses.inject("clear")
+        for motor in self.motors:
+            motor.zero = 0.0
+        self.client = self.here
+        self.run(0.02)
+        self.machine.reset(self.now_ns)
+        self.run(seconds)
+
     def kp(self, arm: int) -> list[float]:
         """Gains of the last commands to the joints of an arm."""
         kinds = [frames.motor_type(name) for name in TYPES]

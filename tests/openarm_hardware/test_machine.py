@@ -394,12 +394,8 @@ def test_an_arm_never_moves_by_itself_whatever_happens_to_it(trials: int) -> Non
         before = bench.q()
         kind = kinds[trial] if trial < len(kinds) else rng.choice(kinds)
         joint = rng.choice(bench.axes).joint
-        values = {
-            "error": rng.choice((8, 9, 10, 11, 12, 13, 14)),
-            "hot": 99,
-            "loss": 0.3,
-            "zero": rng.uniform(-0.3, 0.3),
-        }
+        error, zero = rng.choice((8, 9, 10, 11, 12, 13, 14)), rng.uniform(-0.3, 0.3)
+        values = {"error": error, "hot": 99, "loss": 0.3, "zero": zero}
         if kind == "stop":
             bench.exchange(bench.machine.stop(bench.now_ns, bench.waiting))
         elif kind == "client":
@@ -407,13 +403,7 @@ def test_an_arm_never_moves_by_itself_whatever_happens_to_it(trials: int) -> Non
         elif kind != "zero" or rng.random() < 0.2:
             bench.buses.inject(kind, joint, values.get(kind, 0.0))
         bench.run(rng.uniform(0.01, 0.1))
-        bench.buses.inject("clear")
-        for motor in bench.motors:
-            motor.zero = 0.0
-        bench.client = bench.here
-        bench.run(0.02)
-        bench.machine.reset(bench.now_ns)
-        bench.run(0.2)
+        bench.repair(0.2)
         assert bench.phases == UP, (trial, kind, joint, bench.machine.text)
         for axis, was, now in zip(bench.axes, before, bench.q(), strict=True):
             assert abs(now - was) < (0.004 if axis.grips else 0.03), (trial, kind, axis.joint, was, now)
@@ -457,13 +447,7 @@ def test_an_arm_that_is_stopped_in_motion_stays_whatever_is_commanded_until_it_i
         for axis, was, now in zip(bench.axes, stopped, bench.q(), strict=True):
             # without power a joint runs out against its friction
             assert abs(now - was) < (0.05 if kind == "power" else 0.005), (trial, kind, axis.joint, was, now)
-        bench.buses.inject("clear")
-        for motor in bench.motors:
-            motor.zero = 0.0
-        bench.client = bench.here
-        bench.run(0.02)
-        bench.machine.reset(bench.now_ns)
-        bench.run(0.25)
+        bench.repair(0.25)
         assert bench.phases == UP, (trial, kind, joint, bench.machine.text)
         for axis, was, now in zip(bench.axes, stopped, bench.q(), strict=True):
             assert abs(now - was) < (0.004 if axis.grips else 0.05), (trial, kind, axis.joint, was, now)

@@ -11,8 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.localization import Studio
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.config import load_config
+from openarm_common.resources import config_dir
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detection.localize import Localizer, LocalizerConfig
+from openarm_perception.detection.pipeline import Perceived, Pipeline
+from openarm_perception.geometry.depth import DepthLimits
 
 TABLE = 0.40
 RGBA = {
@@ -74,6 +81,10 @@ class View:
     def millimetres(self) -> NDArray[np.uint16]:
         """The depth as a 16UC1 image."""
         return np.round(self.depth * 1e3).astype(np.uint16)
+
+    def perceived(self, pipeline: Pipeline) -> Perceived:
+        """What a pipeline finds in it."""
+        return pipeline.run(self.rgb, self.depth, self.intrinsics, self.T_base_camera)
 
 
 def look_at(position: Sequence[float], target: Sequence[float], right: Sequence[float]) -> NDArray[np.float64]:
@@ -139,3 +150,23 @@ def tabletop() -> Iterator[Tabletop]:
     scene = Tabletop()
     yield scene
     scene.close()
+
+
+@pytest.fixture(scope="module")
+def detector() -> ColorDetector:
+    """The detector as the suite configures it."""
+    return ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
+
+
+@pytest.fixture(scope="module")
+def pipeline(detector: ColorDetector) -> Pipeline:
+    """Detector and localiser with their defaults."""
+    return Pipeline(detector, Localizer(LocalizerConfig(), DepthLimits(near=0.07), TABLE))
+
+
+@pytest.fixture(scope="module")
+def studio() -> Iterator[Studio]:
+    """Robot, scenes and cameras."""
+    made = Studio()
+    yield made
+    made.close()

@@ -10,19 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import config_dir
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Detection2D, Detector, rank
 
 GREY = (176, 172, 165)
 RED, BLUE = (200, 25, 25), (25, 60, 205)
-
-
-@pytest.fixture(scope="module")
-def detector() -> ColorDetector:
-    """The detector as the suite configures it."""
-    return ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
 
 
 def picture(*boxes: tuple[int, int, int, int, tuple[int, int, int]]):

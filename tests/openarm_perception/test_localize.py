@@ -11,10 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import config_dir
-from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Detection2D
+from openarm_perception.detection.detector import ColorDetector, Detection2D
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
 from openarm_perception.geometry.depth import DepthLimits, View
 from openarm_perception.geometry.footprint import Footprint
@@ -30,12 +28,6 @@ SHAPES = [
     ("cylinder", (0.066, 0.066, 0.115)),
     ("cylinder", (0.04, 0.04, 0.06)),
 ]
-
-
-@pytest.fixture(scope="module")
-def detector() -> ColorDetector:
-    """The detector as the suite configures it."""
-    return ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
 
 
 @pytest.fixture(scope="module")

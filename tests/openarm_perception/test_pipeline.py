@@ -5,27 +5,10 @@ from __future__ import annotations
 
 import pytest
 
-from openarm_common.config import load_config
 from openarm_common.errors import OpenArmError
-from openarm_common.resources import config_dir
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.perception.detections import Frame, find
-from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.detection.localize import Localizer, LocalizerConfig
 from openarm_perception.detection.pipeline import Pipeline
-from openarm_perception.geometry.depth import DepthLimits
-
-
-@pytest.fixture(scope="module")
-def pipeline(tabletop) -> Pipeline:
-    """Detector and localiser with their defaults."""
-    colors = load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig)
-    return Pipeline(ColorDetector(colors), Localizer(LocalizerConfig(), DepthLimits(near=0.07), tabletop.table_height))
-
-
-def run(pipeline: Pipeline, view):
-    """What a view shows."""
-    return pipeline.run(view.rgb, view.depth, view.intrinsics, view.T_base_camera)
 
 
 @pytest.mark.requirement("B-30")
@@ -42,9 +25,9 @@ def test_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
     far = tabletop.Thing("blue", "cylinder", (0.05, 0.05, 0.06), 0.2, 0.3)
     view = tabletop.render([near, far])
     central = Pipeline(pipeline.detector, pipeline.localizer, "centre")
-    assert [p.label for p in run(central, view).located] == ["red", "blue"]
+    assert [p.label for p in view.perceived(central).located] == ["red", "blue"]
     for words in ("blue", "cylinder", "Blue cylinder"):
-        only = run(Pipeline(pipeline.detector, pipeline.localizer, label=words), view)
+        only = view.perceived(Pipeline(pipeline.detector, pipeline.localizer, label=words))
         assert ([p.label for p in only.found], [p.label for p in only.located]) == (["blue"], ["blue"])
 
 
@@ -54,7 +37,7 @@ def test_what_is_partly_hidden_comes_after_what_is_seen_whole(tabletop, pipeline
     hidden = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.16, 0.10, 0.3)
     before = tabletop.Thing("blue", "cylinder", (0.066, 0.066, 0.115), 0.235, 0.115)
     whole = tabletop.Thing("green", "box", (0.05, 0.05, 0.05), 0.27, -0.2)
-    located = run(pipeline, tabletop.render([hidden, before, whole])).located
+    located = tabletop.render([hidden, before, whole]).perceived(pipeline).located
     assert [p.score for p in located] == sorted((p.score for p in located), reverse=True)
     assert located[-1].label == "red"
 
@@ -68,7 +51,7 @@ def test_what_is_grasped_of_several_that_fit_follows_from_the_policy(tabletop, p
         tabletop.Thing("green", "box", (0.05, 0.05, 0.05), 0.27, -0.3),
         tabletop.Thing("blue", "cylinder", (0.066, 0.066, 0.115), 0.305, 0.035),
     ]
-    seen = run(Pipeline(pipeline.detector, pipeline.localizer, policy), tabletop.render(things))
+    seen = tabletop.render(things).perceived(Pipeline(pipeline.detector, pipeline.localizer, policy))
     assert find([Frame(0, seen.boxes)], "cube", DetectConfig()).target.label == first
 
 
@@ -78,7 +61,7 @@ def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None
         tabletop.Thing(c, "box", (0.05, 0.05, 0.05), 0.27, y)
         for c, y in (("red", -0.05), ("blue", 0.0), ("green", 0.05))
     ]
-    perceived = run(pipeline, tabletop.render(things))
+    perceived = tabletop.render(things).perceived(pipeline)
     boxes = {box.label: box for box in perceived.boxes}
     assert set(boxes) == {"red", "blue", "green"}
     built_in = boxes["blue"]
@@ -101,6 +84,6 @@ def test_each_detection_is_cut_out_of_the_depth_image_once(tabletop, pipeline, m
         return cut(found, *args)
 
     monkeypatch.setattr(pipeline.localizer, "cut", counted)
-    perceived = run(pipeline, tabletop.render(things))
+    perceived = tabletop.render(things).perceived(pipeline)
     assert perceived.unmeasured
     assert sorted(labels) == ["blue", "green", "red"]

@@ -10,10 +10,7 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import config_dir
-from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
 from openarm_perception.geometry import plane
 from openarm_perception.geometry.depth import DepthLimits, View
@@ -49,11 +46,6 @@ def test_pixels_above_the_horizon_are_refused(tilt: float, v: float) -> None:
     with pytest.raises(OpenArmError, match="horizon") as error:
         plane.intersect((320.0, v), K, T, FLAT, 0.0)
     assert error.value.code == Code.NOTHING_DETECTED
-
-
-@pytest.fixture(scope="module")
-def detector() -> ColorDetector:
-    return ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
 
 
 def blind(tabletop, height: float) -> Localizer:

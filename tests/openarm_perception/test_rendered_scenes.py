@@ -6,24 +6,14 @@ Seeds 0 to 19 are those of the reported campaigns; nothing here is tuned on them
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
-from benchmarks.localization import Studio, errors
+from benchmarks.localization import errors
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene, random_scene
 
 SIDES = RobotDescription.load().arm_names
-
-
-@pytest.fixture(scope="module")
-def studio() -> Iterator[Studio]:
-    """Robot, scenes and cameras."""
-    studio = Studio()
-    yield studio
-    studio.close()
 
 
 @pytest.mark.requirement("A-26", "A-34", "A-60", "A-63", "A-64", "B-01")

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -22,14 +21,6 @@ from openarm_perception.ros.convert import mask_image
 
 TCP = "openarm_right_hand_tcp"
 RED = (205, 25, 25)
-
-
-@pytest.fixture(scope="module")
-def studio() -> Iterator[Studio]:
-    """Robot, scenes and cameras."""
-    studio = Studio()
-    yield studio
-    studio.close()
 
 
 class Look:

@@ -24,11 +24,6 @@ SIDES = RobotDescription.load().arm_names
 ARM = slice(8, 15)
 
 
-@pytest.fixture(scope="module")
-def description() -> RobotDescription:
-    return RobotDescription.load()
-
-
 def world_of(description: RobotDescription, hardware: HardwareConfig) -> tuple[Stage, World]:
     stage = Stage(description, {}, None, PhysicsConfig(), hardware)
     return stage, stage.world(load_scene("empty"))

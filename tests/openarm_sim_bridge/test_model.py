@@ -26,11 +26,6 @@ GEOM, BODY = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
 
 
 @pytest.fixture(scope="module")
-def description() -> RobotDescription:
-    return RobotDescription.load()
-
-
-@pytest.fixture(scope="module")
 def cameras() -> dict[str, CameraConfig]:
     return load_cameras()
 

@@ -258,11 +258,6 @@ def ros_domain() -> Iterator[int]:
         yield domain
 
 
-@pytest.fixture(scope="module")
-def description() -> RobotDescription:
-    return RobotDescription.load()
-
-
 @pytest.fixture
 def make_bench(ros, description: RobotDescription) -> Callable[..., Bench]:
     """Makes the motion node and its robot; keyword arguments are the node's parameters."""
