@@ -145,7 +145,7 @@ SLOW = ("topic echo /status -n 1", "tf echo world base")
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("lines", [LINES, pytest.param(SLOW, marks=pytest.mark.long)], ids=["quick", "slow"])
+@pytest.mark.parametrize("lines", [LINES, SLOW], ids=["quick", "slow"])
 def test_both_ways_give_the_same_answer(
     graph: Graph, capsys: pytest.CaptureFixture[str], lines: tuple[str, ...]
 ) -> None:

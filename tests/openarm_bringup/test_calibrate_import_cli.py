@@ -88,7 +88,7 @@ def info(path: Path, coefficients: np.ndarray | None = None) -> str:
     [
         ("in_hand", "wxyz", "mm", "T_base_tip", None),
         ("to_hand", "rpy_deg", "m", "T_tip_base", PLUMB_BOB),
-        pytest.param("in_hand", "rotvec", "m", "T_base_tip", RATIONAL, marks=pytest.mark.long),
+        ("in_hand", "rotvec", "m", "T_base_tip", RATIONAL),
     ],
 )
 @pytest.mark.requirement("P-28", "A-36", "A-42")

@@ -431,7 +431,7 @@ def test_the_guard_goes_up_its_ladder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("body", ["time.sleep(60)", pytest.param(DEAF_TO_INT, marks=pytest.mark.long)])
+@pytest.mark.parametrize("body", ["time.sleep(60)", DEAF_TO_INT])
 @pytest.mark.requirement("P-34")
 def test_children_end_when_the_supervisor_is_killed(tmp_path: Path, body: str) -> None:
     """SIGKILL leaves the supervisor no time for anything: its guard ends the nodes."""

@@ -45,9 +45,7 @@ def test_wrong_input_is_named_and_never_silent(kind: wrong_input.Spoil) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("robot", "seed"), [("ur5e", 18), *(pytest.param(*one, marks=pytest.mark.long) for one in product(ROBOTS, (0, 5)))]
-)
+@pytest.mark.parametrize(("robot", "seed"), [("ur5e", 18), *product(ROBOTS, (0, 5))])
 def test_joint_zeros_of_any_arm_are_not_taken_for_another_cause(robot: str, seed: int) -> None:
     """Off by 0.05° to 0.3° rms. With the zeros taken for right, one of these sets names the board's size."""
     problem = robot_set(robot, 20, np.random.default_rng([41, seed])).problem

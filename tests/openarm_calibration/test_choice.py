@@ -94,7 +94,7 @@ def test_parts_of_the_noise_are_found_as_they_were_made(translation: float, rota
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("sets", "views"), [(2, 9), pytest.param(8, 15, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("sets", "views"), [(2, 9), (8, 15)])
 def test_the_choice_makes_the_mount_better_where_boards_are_bent_and_leaves_a_clean_set_alone(
     sets: int, views: int
 ) -> None:

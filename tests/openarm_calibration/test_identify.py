@@ -35,8 +35,8 @@ BOTH = ("left", "right")
     ("hardware", "sides", "places", "cycles"),
     [
         (SHIPPED, ("left",), 2, 4),
-        pytest.param(SHIPPED, BOTH, 6, 8, marks=pytest.mark.long),
-        pytest.param(GAINS, BOTH, 6, 8, marks=pytest.mark.long),
+        (SHIPPED, BOTH, 6, 8),
+        (GAINS, BOTH, 6, 8),
     ],
     ids=["one arm", "as shipped", "gains 30 % off"],
 )

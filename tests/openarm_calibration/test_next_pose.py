@@ -67,9 +67,18 @@ class Arm:
         self.samples.add(Sample(f"s{count:03d}", 10**9 * count, 10**9 * count, joints, 0.0, detection, T))
         return True
 
+    def follow(self, search: PoseSearch, count: int, rng: np.random.Generator) -> None:
+        """Take samples at what is proposed, up to a number of them."""
+        while len(self.samples) < count:
+            proposal = search.propose(self.samples, self.state)[0]
+            if self.look(proposal, rng):
+                search.learn(self.samples)
+            else:
+                search.refuse(proposal)
+
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [pytest.param("wrist", marks=pytest.mark.long), "overhead"])
+@pytest.mark.parametrize("name", ["wrist", "overhead"])
 @pytest.mark.requirement("N-07")
 def test_eight_proposed_poses_calibrate(name: str) -> None:
     """Nominal mount and a ruler are enough to begin; all proposals but the first few show the board; 0.3 mm, 0.03°."""
@@ -131,18 +140,13 @@ def score(arm: Arm) -> float:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["wrist", pytest.param("overhead", marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", ["wrist", "overhead"])
 @pytest.mark.requirement("N-07", "A-40")
 def test_the_proposed_pose_is_more_informative_than_others_that_show_the_board(name: str) -> None:
     """By the true mounts: with a sample at the first proposal the bound is below that with one at the average other."""
     arm, rng = Arm(name), np.random.default_rng(0)
     search = arm.search()
-    while len(arm.samples) < 4:
-        proposal = search.propose(arm.samples, arm.state)[0]
-        if arm.look(proposal, rng):
-            search.learn(arm.samples)
-        else:
-            search.refuse(proposal)
+    arm.follow(search, 4, rng)
     begun, with_one = arm.samples.samples, []
     for proposal in search.propose(arm.samples, arm.state, most=100):
         other = Arm(name)
@@ -162,12 +166,7 @@ def test_poses_that_are_chosen_for_joint_zeros_tell_them_better() -> None:
     for zeros in (0.0, 0.02):
         arm, rng = Arm("overhead"), np.random.default_rng(0)
         search = arm.search(zeros)
-        while len(arm.samples) < 6:
-            proposal = search.propose(arm.samples, arm.state)[0]
-            if arm.look(proposal, rng):
-                search.learn(arm.samples)
-            else:
-                search.refuse(proposal)
+        arm.follow(search, 6, rng)
         noise, X, Z = Noise(0.05, 1e-4, 2e-4), arm.X[None], arm.Z[None]
         joints = len(arm.samples.joint_names)
         priors = Priors(zeros=np.full(joints, 0.02))

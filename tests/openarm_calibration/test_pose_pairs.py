@@ -29,9 +29,7 @@ def test_exact_pairs_give_the_exact_mounts(setup) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("setup", "sets"), [("in_hand", 3), *(pytest.param(setup, 12, marks=pytest.mark.long) for setup in SETUPS)]
-)
+@pytest.mark.parametrize(("setup", "sets"), [("in_hand", 3), *((setup, 12) for setup in SETUPS)])
 @pytest.mark.requirement("A-36")
 def test_the_predicted_error_is_that_of_repetitions_and_the_noise_is_found(setup, sets: int) -> None:
     """Sets with 1 mm and 0.2 degrees: squared error over prediction is 6 on average."""

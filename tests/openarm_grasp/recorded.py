@@ -411,6 +411,12 @@ class Requests:
         """Carry out a request."""
         return self.link.run(carry_out(self.task(label, **request)))
 
+    def succeeds(self, label: str = "", **request: Any) -> GraspOutcome:
+        """Carry out a request that must succeed."""
+        outcome = self.ask(label, **request)
+        assert outcome.success, outcome.message
+        return outcome
+
     def restart(self) -> None:
         """Forget the session, as a node that is started again."""
         self.session = GraspSession(self.session.context)

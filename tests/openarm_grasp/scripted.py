@@ -154,6 +154,17 @@ class World(Skills):
         self.status = []
         return self._run(pick_and_place(self.task(request), request))
 
+    def ends(self, code: Code, text: str = "", label: str = "red", **kwargs: Any) -> GraspOutcome:
+        """Pick and place with one arm, which must end with a code and a text in the message."""
+        outcome = self.grasp(label, **kwargs)
+        assert outcome.code is code, outcome.message
+        assert text in outcome.message
+        return outcome
+
+    def succeeds(self, label: str = "red", **kwargs: Any) -> GraspOutcome:
+        """Pick and place with one arm, which must succeed."""
+        return self.ends(Code.OK, label=label, **kwargs)
+
     def ask(self, label: str = "red", **kwargs: Any) -> GraspOutcome:
         """By whatever strategy."""
         return self._run(carry_out(self.task(GraspRequest(label, **kwargs))))

@@ -67,8 +67,7 @@ def test_what_the_border_cuts_is_placed_when_all_of_it_is_seen_there(recorded: R
 
 def test_where_the_points_of_what_was_placed_are_is_remembered(recorded: Recordings) -> None:
     robot = recorded(alone("banana", 0.27, -0.22, 0.4))
-    outcome = robot.ask("anything")
-    assert outcome.success, outcome.message
+    outcome = robot.succeeds("anything")
     place = tuple(outcome.place_position[:2])
     near, (points,) = robot.session.parts_of((place,))
     assert near == ()
@@ -82,8 +81,7 @@ def test_where_the_points_of_what_was_placed_are_is_remembered(recorded: Recordi
 def kept_banana(recorded: Recordings) -> tuple[Requests, str]:
     """Pick the banana; returns the arm that holds it."""
     robot = recorded(alone("banana", 0.27, -0.22, 0.4))
-    outcome = robot.ask("anything", phase="pick")
-    assert outcome.success, outcome.message
+    robot.succeeds("anything", phase="pick")
     (arm,) = robot.session.kept
     return robot, arm
 
@@ -119,8 +117,7 @@ def test_among_other_things_the_place_is_planned_before_the_lift(recorded: Recor
     table = load_scene("empty").table.model_dump()
     scene = parse_scene({"name": "two", "table": table, "objects": items}, "two")
     robot = recorded(scene)
-    outcome = robot.ask()
-    assert outcome.success, outcome.message
+    robot.succeeds()
     assert "planning the place" in robot.said
 
 

@@ -80,8 +80,7 @@ def test_the_plan_that_is_shown_and_confirmed_is_executed_and_no_other() -> None
         confirm(world, status)
 
     shown = watched(world, nothing_has_moved)
-    outcome = world.grasp(confirm=True)
-    assert outcome.success, outcome.message
+    world.succeeds(confirm=True)
     assert [names(plan) for plan in shown] == [["transfer", "approach", "lift", "carry", "put down", "leave"]]
     assert is_executed(world, *shown)
 
@@ -164,8 +163,7 @@ def test_a_plan_that_the_world_has_overtaken_is_planned_anew_and_asked_about_aga
         confirm(world, status)
 
     shown = watched(world, too_late, still_at_rest)
-    outcome = world.grasp(confirm=True)
-    assert outcome.success, outcome.message
+    world.succeeds(confirm=True)
     first, second = shown
     assert first.id != second.id
     assert is_executed(world, second)
@@ -176,8 +174,7 @@ def test_another_attempt_is_asked_about_again() -> None:
     world = World(standing("red", 0.3, -0.2))
     world.slips = 1
     shown = watched(world)
-    outcome = world.grasp(confirm=True)
-    assert outcome.success, outcome.message
+    outcome = world.succeeds(confirm=True)
     assert (outcome.attempts, len(shown)) == (2, 2)
     first, second = shown
     assert first.id != second.id
@@ -201,8 +198,7 @@ def test_a_place_that_is_planned_anew_is_asked_about_again() -> None:
         report(status)
 
     world.on_report = on_report
-    outcome = world.grasp(confirm=True)
-    assert outcome.success, outcome.message
+    world.succeeds(confirm=True)
     assert [names(plan) for plan in shown] == [
         ["transfer", "approach", "lift", "carry", "put down", "leave"],
         ["carry", "put down", "leave"],
@@ -215,8 +211,7 @@ def test_a_place_that_is_planned_anew_is_asked_about_again() -> None:
 def test_each_phase_is_asked_about() -> None:
     world = World(standing("red", 0.3, -0.2))
     shown = watched(world)
-    outcome = world.grasp(phase="pick", confirm=True)
-    assert outcome.success, outcome.message
+    world.succeeds(phase="pick", confirm=True)
     assert [names(plan) for plan in shown] == [["transfer", "approach", "lift"]]
     assert world.grasp("", phase="place", confirm=True, place=(0.3, -0.3)).success
     assert [names(plan) for plan in shown[1:]] == [["carry", "put down", "leave"]]

@@ -62,8 +62,7 @@ def test_a_new_session_takes_up_what_the_hand_holds_and_places_it_or_releases_it
     robot.restart()
     with pytest.raises(OpenArmError, match="right hand still holds 'blue'"):
         robot.ask("red")
-    outcome = robot.ask(phase="place", place=(0.30, -0.30))
-    assert outcome.success, outcome.message
+    robot.succeeds(phase="place", place=(0.30, -0.30))
     assert np.linalg.norm(robot.pose("blue_box")[:2, 3] - (0.30, -0.30)) < 0.02
 
     assert robot.ask("blue", phase="pick").success
@@ -77,14 +76,12 @@ def test_a_new_session_takes_up_what_the_hand_holds_and_places_it_or_releases_it
     assert robot.link.run(robot.session.release(robot.skills, "")) == "the right hand is open"
     robot.pass_time(1.0)
     assert robot.pose("blue_box")[2, 3] < 0.45
-    outcome = robot.ask("red")
-    assert outcome.success, outcome.message
+    robot.succeeds("red")
 
 
 def test_a_yaw_that_one_hold_cannot_give_is_given_by_another(recorded: Recordings) -> None:
     robot = bench(recorded, BOX)
-    outcome = robot.ask("blue", place=(0.30, -0.30), place_yaw=1.2)
-    assert outcome.success, outcome.message
+    robot.succeeds("blue", place=(0.30, -0.30), place_yaw=1.2)
     assert "trying another grasp" in robot.said
     assert turned(robot, "blue_box", 1.2) < math.radians(15.0)
 
@@ -97,8 +94,7 @@ def test_a_time_limit_ends_a_carry_with_the_object_held_and_a_place_frees_it(rec
     assert outcome.code is Code.TIMEOUT
     assert outcome.kind == "PARTIAL"
     assert robot.pose("blue_box")[2, 3] > 0.43  # not dropped
-    outcome = robot.ask(phase="place")
-    assert outcome.success, outcome.message
+    robot.succeeds(phase="place")
 
 
 @pytest.mark.parametrize("state", ["MOVE_TO_PREGRASP", "MOVE_TO_GRASP", "CLOSE_GRIPPER", "LIFT", "PLACE", "RESET"])
@@ -124,8 +120,7 @@ def test_a_cancel_in_each_state_drops_nothing_and_the_next_request_works(recorde
     assert -np.diff(heights).min() < 0.01  # a tick of 10 ms: it never falls at 1 m/s
     robot.link.cancelled, robot.link.watch = "", lambda: None
     holds = bool(robot.session.kept) and robot.skills.aperture("right") < 0.08
-    outcome = robot.ask(phase="place") if holds else robot.ask("blue")
-    assert outcome.success, outcome.message
+    robot.succeeds(phase="place") if holds else robot.succeeds("blue")
 
 
 @pytest.mark.parametrize("use", [False, True])
@@ -134,16 +129,14 @@ def test_a_grasp_is_held_with_and_without_the_force_of_the_pads(recorded: Record
     """The simulated pads feel half the closing force each; a hand that is closed on nothing feels none."""
     robot = bench(recorded, CUBE, config=GraspConfig(held=HeldConfig(use_finger_force=use)))
     assert max(robot.link.pads("left")) < 0.1
-    outcome = robot.ask("red", phase="pick")
-    assert outcome.success, outcome.message
+    robot.succeeds("red", phase="pick")
     assert min(robot.link.pads("left")) > 5.0
 
 
 @pytest.mark.requirement("N-20")
 def test_the_closing_force_can_be_limited(recorded: Recordings) -> None:
     robot = bench(recorded, CUBE, config=GraspConfig(hand=HandConfig(close_effort=12.0)))
-    outcome = robot.ask("red", phase="pick")
-    assert outcome.success, outcome.message
+    robot.succeeds("red", phase="pick")
     assert 10.0 < abs(robot.link.effort("openarm_left_finger_joint1")) <= 12.001
 
 

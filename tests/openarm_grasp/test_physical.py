@@ -61,8 +61,7 @@ class Watched:
 @pytest.mark.requirement("P-07", "P-10")
 def test_the_object_rises_with_the_hand_and_is_not_dragged_when_it_leaves(recorded: Recordings) -> None:
     robot = bench(recorded)
-    outcome = robot.ask("blue")
-    assert outcome.success, outcome.message
+    outcome = robot.succeeds("blue")
     watched = Watched.of(robot)
     lift = watched.during("LIFT")[[0, -1]]
     risen, hand = np.diff(watched.p_object[lift], axis=0)[0], np.diff(watched.p_tcp[lift], axis=0)[0]

@@ -17,8 +17,7 @@ from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Obser
 # --- success
 @pytest.mark.requirement("B-06", "B-57")
 def test_a_grasp_goes_through_all_states_in_order(world):
-    outcome = world.grasp()
-    assert outcome.success, outcome.message
+    outcome = world.succeeds()
     assert (outcome.arm, outcome.attempts, outcome.label) == ("right", 1, "red")
     order = [s for i, s in enumerate(world.states) if i == 0 or s is not world.states[i - 1]]
     assert order == [*list(State)[1:], State.IDLE]
@@ -81,8 +80,7 @@ def test_twenty_cycles_unattended(world):
 
 
 def test_a_place_that_is_asked_for_is_used(world):
-    outcome = world.grasp(place=(0.3, -0.35, 0.0))
-    assert outcome.success
+    outcome = world.succeeds(place=(0.3, -0.35, 0.0))
     assert outcome.place_position == pytest.approx((0.3, -0.35, 0.4))
 
 
@@ -121,8 +119,7 @@ def test_an_object_is_asked_for_by_class_colour_shape_or_several_words(worlds, b
     world = worlds(can, replace(box("Tasse", 0.26, 0.2), color="red", kind="cube"))
     outcome = world.grasp(words)
     assert (outcome.code, outcome.label) == (Code.OK, label), outcome.message
-    outcome = world.grasp("blue can")
-    assert outcome.code is Code.UNKNOWN_OBJECT
+    outcome = world.ends(Code.UNKNOWN_OBJECT, label="blue can")
     # the scripted hand puts down what has no further attributes
     assert outcome.message.startswith("no 'blue can' in view; in view: ")
 
@@ -144,8 +141,7 @@ def test_others_are_obstacles_and_the_target_may_be_touched(world):
 
 
 def test_dry_run_plans_both_and_moves_nothing(world):
-    outcome = world.grasp(dry_run=True)
-    assert outcome.success
+    outcome = world.succeeds(dry_run=True)
     assert outcome.attempts == 0
     assert "can be done" in outcome.message
     assert not world.done(Follow) + world.done(Grip) + world.done(GoHome) + world.done(MoveLinear)
@@ -157,8 +153,7 @@ def test_dry_run_plans_both_and_moves_nothing(world):
 # --- seeing
 @pytest.mark.requirement("B-58")
 def test_an_unknown_object_is_refused_with_what_is_in_view(world):
-    outcome = world.grasp("mug")
-    assert outcome.code is Code.UNKNOWN_OBJECT
+    outcome = world.ends(Code.UNKNOWN_OBJECT, label="mug")
     assert outcome.message == "no 'mug' in view; in view: blue, red"
     assert world.states.count(State.DETECT) == 3
     assert State.TRANSFORM not in world.states
@@ -183,24 +178,20 @@ def test_an_object_that_comes_into_view_is_waited_for(worlds, box):
 @pytest.mark.requirement("P-33")
 def test_a_stale_detection_is_not_acted_on(world):
     world.frame_age = 0.6
-    outcome = world.grasp()
-    assert outcome.code is Code.STALE_DATA
-    assert "0.60 s old" in outcome.message
+    world.ends(Code.STALE_DATA, "0.60 s old")
     assert not world.done(PlanGrasp)
 
 
 def test_no_frames_end_the_grasp_at_once(world):
     world.fail(lambda e: isinstance(e, Observe), Code.STALE_DATA)
-    outcome = world.grasp()
-    assert outcome.code is Code.STALE_DATA
+    world.ends(Code.STALE_DATA)
     assert len(world.done(Observe)) == 1
 
 
 @pytest.mark.requirement("B-33")
 def test_no_transform_means_no_motion(world):
     world.fail(lambda e: isinstance(e, ToBase), Code.NO_TRANSFORM)
-    outcome = world.grasp()
-    assert outcome.code is Code.NO_TRANSFORM
+    world.ends(Code.NO_TRANSFORM)
     assert not world.done(Follow)
 
 
@@ -215,17 +206,14 @@ def test_too_wide_is_refused_with_width_and_limit(worlds, box):
 @pytest.mark.requirement("B-58")
 def test_a_failed_plan_looks_again(world):
     world.fail(lambda e: isinstance(e, PlanGrasp), Code.NO_PLAN, times=1)
-    outcome = world.grasp()
-    assert outcome.success
+    outcome = world.succeeds()
     assert world.states.count(State.PLAN) == 2
     assert outcome.attempts == 1
 
 
 def test_out_of_reach_names_the_reason_and_the_nearest_arm(world):
     world.fail(lambda e: isinstance(e, PlanGrasp), Code.UNREACHABLE)
-    outcome = world.grasp()
-    assert outcome.code is Code.UNREACHABLE
-    assert "right arm gets within 200 mm" in outcome.message
+    outcome = world.ends(Code.UNREACHABLE, "right arm gets within 200 mm")
     assert len(world.done(PlanGrasp)) == 4  # plan_attempts, each also on shorter lines
     assert {one.candidates[0].id.endswith("/short") for one in world.done(PlanGrasp)} == {False, True}
     assert outcome.attempts == 0
@@ -234,16 +222,13 @@ def test_out_of_reach_names_the_reason_and_the_nearest_arm(world):
 def test_in_the_overlap_the_second_arm_is_tried(worlds, box):
     world = worlds(box("red", 0.26, -0.05))
     world.fail(lambda e: isinstance(e, PlanGrasp) and e.arm == "right", Code.NO_PLAN)
-    outcome = world.grasp()
-    assert outcome.success
+    outcome = world.succeeds()
     assert outcome.arm == "left"
 
 
 def test_a_place_out_of_reach_is_refused_before_anything_moves(world):
     world.fail(lambda e: isinstance(e, PlanPlace), Code.UNREACHABLE)
-    outcome = world.grasp(place=(0.75, -0.5))
-    assert outcome.code is Code.UNREACHABLE
-    assert "could grasp, but not place" in outcome.message
+    world.ends(Code.UNREACHABLE, "could grasp, but not place", place=(0.75, -0.5))
     assert not world.done(Follow)
 
 

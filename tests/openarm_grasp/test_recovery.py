@@ -25,8 +25,7 @@ from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Wait
 @pytest.mark.requirement("A-70")
 def test_a_miss_opens_backs_off_and_tries_another_way(world):
     world.slips = 1
-    outcome = world.grasp()
-    assert outcome.success
+    outcome = world.succeeds()
     assert outcome.attempts == 2
     missed = world.log[world.log.index(next(x for x in world.log if world.grips(opening=False)(x[1]))) :]
     kinds = [type(e) for _, e in missed[3:8]]  # pause, measure
@@ -59,16 +58,13 @@ def test_without_an_object_the_grasp_fails(worlds, box):
     """The object disappears after its detection: three attempts at most, never a success."""
     world = worlds(box("red", 0.26, -0.2))
     world.faults.append(lambda e: world.objects.clear() if isinstance(e, PlanGrasp) else None)
-    outcome = world.grasp()
-    assert outcome.code is Code.GRASP_MISSED
-    assert "nothing is in view" in outcome.message
+    outcome = world.ends(Code.GRASP_MISSED, "nothing is in view")
     assert outcome.attempts == 1
 
 
 def test_three_misses_end_with_a_named_refusal_open_hand_and_home(world):
     world.slips = 99
-    outcome = world.grasp()
-    assert outcome.code is Code.GRASP_MISSED
+    outcome = world.ends(Code.GRASP_MISSED)
     assert outcome.attempts == 3
     assert world.gap == pytest.approx(0.088)
     moved = [call for _, call in world.log if isinstance(call, (Follow, GoHome, MoveLinear))]
@@ -84,16 +80,13 @@ def test_where_an_object_is_that_was_moved_in_vain_is_said(world, box):
             world.objects.update(red=box("red", 0.34, -0.2))
 
     world.faults.append(roll)
-    outcome = world.grasp()
-    assert outcome.code is Code.GRASP_MISSED
+    outcome = world.ends(Code.GRASP_MISSED)
     assert outcome.object_position[0] == pytest.approx(0.34)
 
 
 def test_a_hand_that_stops_short_has_met_the_object(world):
     world.tcp_error = 0.02
-    outcome = world.grasp()
-    assert outcome.code is Code.HAND_COLLISION
-    assert "20.0 mm" in outcome.message
+    world.ends(Code.HAND_COLLISION, "20.0 mm")
     assert not world.times(world.grips(opening=False))
 
 
@@ -106,8 +99,7 @@ def test_an_object_that_moves_before_the_hand_goes_down_is_not_touched(world, bo
             moved.append(world.objects.update(red=box("red", 0.30, -0.2)))
 
     world.faults.append(nudge)
-    outcome = world.grasp()
-    assert outcome.success, outcome.message
+    outcome = world.succeeds()
     assert outcome.attempts == 2
     assert len(world.times(world.follows_path("approach"))) == 1  # the first hand did not go down
     assert world.done(PlanGrasp)[1].candidates[0].T_base_tcp[0, 3] == pytest.approx(0.30)
@@ -125,8 +117,7 @@ def test_a_placed_object_that_the_detector_misses_is_looked_for_again(world):
         return real(count)
 
     world.frames = frames
-    outcome = world.grasp()
-    assert outcome.success, outcome.message
+    outcome = world.succeeds()
     assert (outcome.attempts, missed) == (1, [3])
 
 
@@ -142,8 +133,7 @@ def test_an_alarm_that_the_look_from_home_does_not_confirm_is_raised_once(world,
         return Frames(tuple(Frame(frame.t_ns, (shifted,)) for frame in found.frames), "base")
 
     world.frames = frames
-    outcome = world.grasp()
-    assert outcome.success, outcome.message
+    outcome = world.succeeds()
     assert outcome.attempts == 2
 
 
@@ -151,9 +141,8 @@ def test_an_alarm_that_the_look_from_home_does_not_confirm_is_raised_once(world,
 def test_an_object_that_has_fallen_over_is_reported(world, box):
     """It stands at its target, lower than it was: nothing that the hand could try again would right it."""
     world.objects["red"] = box("red", 0.26, -0.2, size=0.06)
-    outcome = world.grasp()  # the scripted hand puts down cubes of 50 mm
-    assert outcome.code is Code.PLACE_FAILED
-    assert "has fallen over: it is 50 mm high there and was 60 mm" in outcome.message
+    # the scripted hand puts down cubes of 50 mm
+    outcome = world.ends(Code.PLACE_FAILED, "has fallen over: it is 50 mm high there and was 60 mm")
     assert outcome.attempts == 1
 
 
@@ -161,9 +150,7 @@ def test_an_object_that_has_fallen_over_is_reported(world, box):
 def test_held_but_still_seen_in_its_place_is_put_back(world):
     """The hand has something, but the camera says it is not the object: no success, and nothing is dropped."""
     world.lifted = lambda label: None
-    outcome = world.grasp()
-    assert outcome.code is Code.GRASP_MISSED
-    assert "still stands at its place" in outcome.message
+    world.ends(Code.GRASP_MISSED, "still stands at its place")
     linear = [e.what for e in world.done(MoveLinear)]
     assert linear == ["put back", "back off"] * 3
 
@@ -177,8 +164,7 @@ def test_lost_on_the_way_is_found_again(world, box):
         return OpenArmError(Code.GRASP_LOST, "dropped by injection")
 
     world.faults.append(drop_once)
-    outcome = world.grasp()
-    assert outcome.success
+    outcome = world.succeeds()
     assert outcome.attempts == 2
 
 
@@ -186,16 +172,13 @@ def test_lost_on_the_way_is_found_again(world, box):
 @pytest.mark.requirement("P-09")
 def test_a_place_that_is_not_seen_within_2_cm_is_tried_again(world):
     world.place_error = 0.03
-    outcome = world.grasp()
-    assert outcome.code is Code.PLACE_FAILED
-    assert "30 mm from its target" in outcome.message
+    outcome = world.ends(Code.PLACE_FAILED, "30 mm from its target")
     assert outcome.attempts == 3
 
 
 def test_a_place_that_cannot_be_planned_puts_the_object_back(world):
     world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN, times=1)
-    outcome = world.grasp()
-    assert outcome.code is Code.PLACE_FAILED
+    outcome = world.ends(Code.PLACE_FAILED)
     assert world.objects["red"].p_base[:2] == pytest.approx((0.26, -0.2))
     assert not world.session.kept
     assert outcome.place_position == (0.0, 0.0, 0.0)
@@ -203,8 +186,7 @@ def test_a_place_that_cannot_be_planned_puts_the_object_back(world):
 
 def test_a_carry_that_was_blocked_puts_the_object_back_and_tries_again(world):
     world.fail(world.follows_path("carry"), Code.EXECUTION_FAILED, times=1)
-    outcome = world.grasp()
-    assert outcome.success, outcome.message
+    outcome = world.succeeds()
     assert outcome.attempts == 2
     first, _, second = world.done(PlanPlace)
     assert first.targets[0].position != pytest.approx(second.targets[0].position)
@@ -212,9 +194,7 @@ def test_a_carry_that_was_blocked_puts_the_object_back_and_tries_again(world):
 
 def test_a_hand_that_can_put_its_object_nowhere_keeps_it_and_says_so(world):
     world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN)
-    outcome = world.grasp()
-    assert outcome.code is Code.PLACE_FAILED
-    assert "still holds 'red'" in outcome.message
+    world.ends(Code.PLACE_FAILED, "still holds 'red'")
     assert world.held == "red"
     assert list(world.session.kept) == ["right"]
 
@@ -222,8 +202,7 @@ def test_a_hand_that_can_put_its_object_nowhere_keeps_it_and_says_so(world):
 def test_what_hangs_around_the_hand_is_let_go_though_no_plan_knows_how_it_hangs(world):
     """As far as known the hand could not leave it: another thing may have come along."""
     world.fail(lambda e: isinstance(e, PlanPlace) and e.held, Code.IN_COLLISION)
-    outcome = world.grasp()
-    assert outcome.code is Code.PLACE_FAILED
+    world.ends(Code.PLACE_FAILED)
     assert world.held is None
     assert not world.session.kept
     assert any("as what has turned in the hand" in status.reason for status in world.status)
@@ -231,8 +210,7 @@ def test_what_hangs_around_the_hand_is_let_go_though_no_plan_knows_how_it_hangs(
 
 def test_a_failed_way_back_after_release_still_ends_well(world):
     world.fail(world.follows_path("leave"), Code.EXECUTION_FAILED, times=1)
-    outcome = world.grasp()
-    assert outcome.success
+    world.succeeds()
     assert [e.what for e in world.done(MoveLinear)] == ["leave"]
 
 
@@ -265,8 +243,7 @@ def test_an_arm_that_finds_no_way_home_keeps_the_other_from_nothing(world, code,
 @pytest.mark.parametrize("state", list(State)[1:])
 def test_a_stop_in_any_state_ends_the_request_and_the_next_works(world, state, code):
     world.faults.append(lambda e: OpenArmError(code, "stopped by injection") if world.state is state else None)
-    outcome = world.grasp()
-    assert outcome.code is code
+    world.ends(code)
     assert world.states[-2:] == [state, State.IDLE]
     world.faults.clear()
     if world.held:
@@ -277,8 +254,7 @@ def test_a_stop_in_any_state_ends_the_request_and_the_next_works(world, state, c
 @pytest.mark.requirement("P-21")
 def test_a_cancel_while_carrying_keeps_the_object(world):
     world.fail(world.follows_path("carry"), Code.CANCELLED)
-    outcome = world.grasp()
-    assert outcome.code is Code.CANCELLED
+    world.ends(Code.CANCELLED)
     assert world.held == "red"
     assert list(world.session.kept) == ["right"]
     assert world.times(world.grips(opening=True)) == world.times(world.grips(opening=True))[:1]
@@ -293,9 +269,7 @@ def test_a_request_for_an_unknown_arm_is_refused_and_the_next_works(world):
 
 def test_a_defect_of_the_program_is_answered_and_the_next_request_works(world):
     world.faults.append(lambda call: 1 / 0 if isinstance(call, PlanGrasp) else None)
-    outcome = world.grasp()
-    assert outcome.code is Code.INTERNAL
-    assert "ZeroDivisionError" in outcome.message
+    world.ends(Code.INTERNAL, "ZeroDivisionError")
     world.faults.clear()
     assert world.grasp().success
 
@@ -327,8 +301,7 @@ def test_what_has_turned_in_the_hand_is_put_back_though_the_map_shows_it_there(w
                 raise OpenArmError(Code.EXECUTION_FAILED, "the tool ended 14 mm from its goal; blocked?")
 
     world.follow = back
-    outcome = world.grasp()
-    assert outcome.code is Code.GRASP_LOST, outcome.message
+    outcome = world.ends(Code.GRASP_LOST)
     assert outcome.attempts == 3
     assert not outcome.held
     for plan in world.done(PlanPlace):
@@ -347,8 +320,7 @@ def test_what_meets_something_just_above_its_place_is_let_go_there(world, above,
 
     world.T_base_tcp = hand
     world.fail(world.follows_path("put down"), Code.EXECUTION_FAILED, times=1)
-    outcome = world.grasp()
-    assert outcome.success, outcome.message
+    outcome = world.succeeds()
     assert outcome.attempts == (1 if let_go else 2)
 
 
@@ -379,8 +351,7 @@ def test_what_a_hand_kept_is_let_go_where_it_meets_something_and_taken_from_ther
 
     world.T_base_tcp = hand
     world.fail(world.follows_path("put down"), Code.EXECUTION_FAILED, times=1)
-    outcome = world.grasp(phase="place")
-    assert outcome.success, outcome.message
+    outcome = world.succeeds(phase="place")
     assert outcome.attempts == 2
     assert not world.session.kept
     assert any("50 mm above its place" in status.reason for status in world.status)
@@ -390,8 +361,7 @@ def test_what_a_hand_holds_and_meets_something_on_its_way_back_is_let_go_there(w
     world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN, times=1)
     world.lifted = lambda label: None  # it is still seen in its place
     world.fail(lambda e: isinstance(e, MoveLinear) and e.what == "put back", Code.EXECUTION_FAILED)
-    outcome = world.grasp()
-    assert outcome.code is Code.GRASP_MISSED, outcome.message
+    outcome = world.ends(Code.GRASP_MISSED)
     assert not outcome.held
     assert world.held is None
 

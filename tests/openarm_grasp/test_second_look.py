@@ -84,8 +84,7 @@ def test_a_second_look_that_does_not_help_changes_nothing(what: str, worlds, box
     if what == "no plan":
         corrects = lambda call: isinstance(call, PlanGrasp) and len(call.candidates) == 1  # noqa: E731
         world.fail(corrects, Code.NO_PLAN)
-    outcome = world.grasp()
-    assert outcome.success, outcome.message
+    world.succeeds()
     (reason,) = [status.reason for status in world.status if status.state.value == "MOVE_TO_GRASP"][:1]
     assert ("going on without" if what == "no plan" else "second observation") in reason
     assert [call.trajectory for call in world.done(Follow)][:2] == ["transfer", "approach"]
@@ -103,7 +102,7 @@ def test_a_second_look_corrects_the_grasp_before_the_hand_goes_down(worlds, box)
         return Frames(tuple(replace(frame, detections=(box("red", 0.27, -0.2),)) for frame in seen.frames), "base")
 
     world.observe = observe
-    assert world.grasp().success
+    world.succeeds()
     first, second = world.done(PlanGrasp)
     assert (len(first.candidates), len(second.candidates)) == (28, 1)
     assert second.candidates[0].T_base_tcp[0, 3] == pytest.approx(0.27)

@@ -72,9 +72,7 @@ def test_a_strategy_that_takes_a_step_that_is_not_allowed_ends_as_a_defect(world
         return grasp, why
 
     monkeypatch.setattr(steps, "close", no_closing)
-    outcome = world.grasp()
-    assert outcome.code is Code.INTERNAL
-    assert "LIFT may not follow MOVE_TO_GRASP" in outcome.message
+    world.ends(Code.INTERNAL, "LIFT may not follow MOVE_TO_GRASP")
     assert [call.trajectory for call in world.done(Follow)] == ["transfer", "approach"]
 
 

@@ -106,7 +106,7 @@ def test_a_picture_shows_every_object_in_its_colour_and_a_robot_without_colour(t
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("view", [v if v == "top" else pytest.param(v, marks=pytest.mark.long) for v in VIEWS])
+@pytest.mark.parametrize("view", VIEWS)
 def test_every_view_shows_the_robot(view: str) -> None:
     image = render("empty", width=160, height=120, view=view)
     assert (image.max(axis=2) < 40).mean() > 0.005  # its black parts

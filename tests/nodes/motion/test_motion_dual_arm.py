@@ -36,9 +36,7 @@ def watched(bench, goal: MoveArms.Goal) -> tuple[MoveArms.Result, float]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "strategy", [pytest.param(MoveArms.Goal.TOGETHER, marks=pytest.mark.long), MoveArms.Goal.STAGGERED]
-)
+@pytest.mark.parametrize("strategy", [MoveArms.Goal.TOGETHER, MoveArms.Goal.STAGGERED])
 @pytest.mark.requirement("N-12")
 def test_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
     watched(bench, both_goal(over_the_middle(bench, "left"), home("right"), strategy=strategy))
