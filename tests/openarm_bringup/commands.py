@@ -20,6 +20,14 @@ def calibrate(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str,
     return code, out, err
 
 
+def calibrate_fails(capsys: pytest.CaptureFixture[str], code: int, words: str, *argv: str) -> None:
+    """Run `openarm calibrate`, which must end with a code, and with a sentence that has some words."""
+    got, out, err = calibrate(capsys, *argv)
+    assert got == code, err
+    assert words in err
+    assert "Traceback" not in out + err
+
+
 def answer_of(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict[str, Any]]:
     """Exit code and JSON of a command."""
     code = cli.run([*argv, "--json"])

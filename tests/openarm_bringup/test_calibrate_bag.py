@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,7 +23,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, ns_to_stamp
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
-from tests.openarm_bringup.commands import calibrate
+from tests.openarm_bringup.commands import answer_of, calibrate, calibrate_fails
 from tests.openarm_calibration.known_session import BOARD, Known, make_session, photograph
 
 MS = 1_000_000
@@ -118,9 +117,8 @@ def test_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag, known, 
     """One sample of each stand, to 0.05 mm of the true mount; what moved, was empty or had no joints is reported."""
     store, session = tmp_path / "store", tmp_path / "session.npz"
     argv = ("--store", str(store), "--session", str(session))
-    code, out, err = calibrate(capsys, "solve", str(bag), "--save", *argv, "--json")
-    assert code == 0, err
-    data = json.loads(out)
+    code, data = answer_of(capsys, "calibrate", "solve", str(bag), "--save", *argv)
+    assert code == 0, data["message"]
     stills = data["stills"]
     stands = [row for row in stills if row["code"] in ("OK", "NOTHING_DETECTED")]
     assert [row["sample"] for row in stands] == [f"s{k:03d}" for k in range(1, PLACES + 1)] + [""]
@@ -158,28 +156,22 @@ def test_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag, known, 
 )
 def test_wrong_calls_on_a_bag(capsys, bag, tmp_path, monkeypatch, argv: list[str], code: int, words: str) -> None:
     monkeypatch.chdir(tmp_path)
-    got, _, err = calibrate(capsys, "solve", str(bag), *argv)
-    assert got == code, err
-    assert words in err
+    calibrate_fails(capsys, code, words, "solve", str(bag), *argv)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("topic", ["/wrist/color/image_raw", "/wrist/color/camera_info", "/joint_states"])
 def test_a_bag_that_lacks_a_topic_is_refused(capsys, known, tmp_path: Path, topic: str) -> None:
-    code, _, err = calibrate(capsys, "solve", str(record(tmp_path / "bag", known, 1, without=topic)))
-    assert code == 2
-    assert topic.removeprefix("/wrist") in err
+    bag = record(tmp_path / "bag", known, 1, without=topic)
+    calibrate_fails(capsys, 2, topic.removeprefix("/wrist"), "solve", str(bag))
 
 
 def test_options_of_a_bag_are_refused_for_a_session_file(capsys, known, tmp_path: Path) -> None:
     path = tmp_path / "s.npz"
     known.samples.save(path)
-    code, _, err = calibrate(capsys, "solve", str(path), "--camera", "wrist", "--mount-seed", "1")
-    assert code == 2
-    assert "--camera, --mount-seed: for a bag" in err
+    options = ("--camera", "wrist", "--mount-seed", "1")
+    calibrate_fails(capsys, 2, "--camera, --mount-seed: for a bag", "solve", str(path), *options)
 
 
 def test_a_folder_that_is_no_bag_is_refused(capsys, tmp_path: Path) -> None:
-    code, _, err = calibrate(capsys, "solve", str(tmp_path))
-    assert code == 2
-    assert "is not a bag" in err
+    calibrate_fails(capsys, 2, "is not a bag", "solve", str(tmp_path))

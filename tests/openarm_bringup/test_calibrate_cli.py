@@ -17,7 +17,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose
-from tests.openarm_bringup.commands import calibrate
+from tests.openarm_bringup.commands import answer_of, calibrate, calibrate_fails
 from tests.openarm_calibration.known_session import make_session
 
 pytestmark = pytest.mark.usefixtures("own_store")
@@ -42,9 +42,7 @@ def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_p
     assert "2 in its history" in out
     assert "mount seed 1" in out
     assert calibrate(capsys, "rollback", "wrist")[0] == 0
-    code, _, err = calibrate(capsys, "rollback", "wrist")
-    assert code == 1
-    assert "going back needs a calibration of" in err
+    calibrate_fails(capsys, 1, "going back needs a calibration of", "rollback", "wrist")
     page = tmp_path / "report.html"
     assert calibrate(capsys, "report", str(session_file), str(page))[0] == 0
     text = page.read_text()
@@ -55,10 +53,8 @@ def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_p
     assert text.count('class="gauge"') == 7
     assert text.count('class="bar"') == 2 * 10
     assert "http" not in text.replace("http-equiv", "")
-    code, out, _ = calibrate(capsys, "check", str(session_file), "--json")
-    data = json.loads(out)
-    assert code == 0
-    assert data["grade"] == "pass"
+    code, data = answer_of(capsys, "calibrate", "check", str(session_file))
+    assert (code, data["grade"]) == (0, "pass")
     assert data["figures"]["drift"] < 1e-6
 
 
@@ -88,9 +84,7 @@ def test_wrong_intrinsics_are_found_with_the_mount(capsys, tmp_path: Path) -> No
     known.samples.head = head.model_copy(update={"intrinsics": (width, height, 1.03 * fx, 1.03 * fy, cx, cy)})
     path = tmp_path / "wrong.npz"
     known.samples.save(path)
-    code, _, err = calibrate(capsys, "solve", str(path))
-    assert code == 1
-    assert "are these its intrinsics?" in err
+    calibrate_fails(capsys, 1, "are these its intrinsics?", "solve", str(path))
     report = tmp_path / "report.json"
     code, out, err = calibrate(capsys, "solve", str(path), "--free-intrinsics", "--json", str(report))
     assert code == 0, err
@@ -163,28 +157,24 @@ def test_wrong_calls_say_what_is_wrong(
     capsys, session_file: Path, tmp_path: Path, monkeypatch, argv: list[str], code: int, words: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    got, _, err = calibrate(capsys, *[str(session_file) if word == "SESSION" else word for word in argv])
-    assert got == code, err
-    assert words in err
-    assert "Traceback" not in err
+    calibrate_fails(capsys, code, words, *(str(session_file) if word == "SESSION" else word for word in argv))
     assert list(tmp_path.glob("b.*")) == []
 
 
 @pytest.mark.requirement("A-41")
 def test_a_degenerate_session_is_exit_code_1_with_advice(capsys, session_file: Path) -> None:
     names = [f"s{k:03d}" for k in range(3, 11)]
-    code, _, err = calibrate(capsys, "solve", str(session_file), *[word for n in names for word in ("--exclude", n)])
-    assert code == 1
-    assert "DEGENERATE: too few poses: 2" in err
+    left_out = [word for name in names for word in ("--exclude", name)]
+    calibrate_fails(capsys, 1, "DEGENERATE: too few poses: 2", "solve", str(session_file), *left_out)
 
 
 @pytest.mark.requirement("B-14")
 def test_sessions_of_both_cameras_are_solved_together(capsys, session_file: Path, tmp_path: Path) -> None:
     other = tmp_path / "overhead.npz"
     make_session("to_hand", 12).samples.save(other)
-    code, out, err = calibrate(capsys, "together", str(session_file), str(other), "--save", "--json")
-    assert code == 0, err
-    assert list(json.loads(out)["cameras"]) == ["wrist", "overhead"]
+    code, data = answer_of(capsys, "calibrate", "together", str(session_file), str(other), "--save")
+    assert code == 0, data["message"]
+    assert list(data["cameras"]) == ["wrist", "overhead"]
     listed = calibrate(capsys, "list")[1]
     assert "overhead: " in listed
     assert "wrist: " in listed
@@ -224,9 +214,8 @@ def test_auto_takes_the_fixed_camera_first_and_reports_the_results(
         return calibration.CalibrationRun(tmp_path, results, 1.0, error)
 
     monkeypatch.setattr(calibration, "run_calibration", run_it)
-    got, out, _ = calibrate(capsys, "auto", "--mount-seed", "3", "--poses", "12", "--save", "--json")
+    got, data = answer_of(capsys, "calibrate", "auto", "--mount-seed", "3", "--poses", "12", "--save")
     assert got == code
-    data = json.loads(out)
     assert words in f"{data['code']}: {data['message']}"
     assert (asked[0].cameras, asked[0].mount_seed, asked[0].poses) == (("overhead", "wrist"), 3, 12)
     assert asked[0].save

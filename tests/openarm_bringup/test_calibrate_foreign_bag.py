@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, ns_to_stamp
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
-from tests.openarm_bringup.commands import calibrate
+from tests.openarm_bringup.commands import answer_of, calibrate_fails
 from tests.openarm_calibration import foreign_files as files
 from tests.openarm_calibration import known_session
 
@@ -113,14 +112,13 @@ def test_a_bag_of_another_robot_with_a_lens_is_solved_and_its_session_too(capsys
     """URDF of the bag, CompressedImage, rational_polynomial, joint states of two drivers."""
     session = tmp_path / "eye.npz"
     argv = ("--camera-kind", "eye_in_hand", "--tip", "ur_tool", "--board", BOARD, "--session", str(session))
-    code, out, err = calibrate(capsys, "import", str(bag), *argv, "--store", str(tmp_path), "--json")
-    assert code == 0, err
-    data = json.loads(out)
+    code, data = answer_of(capsys, "calibrate", "import", str(bag), *argv, "--store", str(tmp_path))
+    assert code == 0, data["message"]
     assert [row["sample"] for row in data["stills"]] == [f"s{k + 1:03d}" for k in range(PLACES)]
     assert off(data, known) < 2e-4
-    code, out, err = calibrate(capsys, "solve", str(session), "--store", str(tmp_path), "--json")
-    assert code == 0, err
-    assert off(json.loads(out), known) < 2e-4
+    code, data = answer_of(capsys, "calibrate", "solve", str(session), "--store", str(tmp_path))
+    assert code == 0, data["message"]
+    assert off(data, known) < 2e-4
 
 
 @pytest.mark.requirement("P-28", "A-44")
@@ -128,11 +126,10 @@ def test_a_bag_without_a_description_is_solved_by_tf(capsys, known, tmp_path: Pa
     """A raw image, no distortion, a chain of a moving and a static frame."""
     path = record(tmp_path / "bag", known, ("/eye/image", "/eye/camera_info", "/tf", "/tf_static"), None)
     argv = ("--camera-kind", "eye_in_hand", "--base", "ur_base", "--tip", "ur_tool", "--board", BOARD)
-    code, out, err = calibrate(
-        capsys, "import", str(path), *argv, "--joint-topic", "tf", "--store", str(tmp_path / "s"), "--json"
-    )
-    assert code == 0, err
-    assert off(json.loads(out), known) < 1e-4
+    store = ("--store", str(tmp_path / "s"))
+    code, data = answer_of(capsys, "calibrate", "import", str(path), *argv, "--joint-topic", "tf", *store)
+    assert code == 0, data["message"]
+    assert off(data, known) < 1e-4
 
 
 TIP = ("--camera-kind", "eye_in_hand", "--tip", "ur_tool")
@@ -154,6 +151,4 @@ TIP = ("--camera-kind", "eye_in_hand", "--tip", "ur_tool")
     ],
 )
 def test_wrong_calls_say_what_there_is(capsys, bag: Path, argv, words: str) -> None:
-    code, _, err = calibrate(capsys, "import", str(bag), *argv)
-    assert code == 2, err
-    assert words in err
+    calibrate_fails(capsys, 2, words, "import", str(bag), *argv)

@@ -18,7 +18,7 @@ from openarm_calibration.store.store import CalibrationStore
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.robot.description import RobotDescription
-from tests.openarm_bringup.commands import calibrate
+from tests.openarm_bringup.commands import answer_of, calibrate_fails
 from tests.openarm_calibration import foreign_files as files
 
 pytestmark = [pytest.mark.requirement("R-14"), pytest.mark.usefixtures("own_store")]
@@ -49,11 +49,9 @@ def test_pose_pairs_of_other_tools_are_solved_and_stored_by_one_command(
 ) -> None:
     known = files.truth("in_hand" if kind == "eye_in_hand" else "to_hand", 15, 2e-4, 4e-4)
     path = writer(tmp_path / name, known)
-    code, out, err = calibrate(
-        capsys, "import", str(path), "--camera-kind", kind, "--camera", "cam", "--save", "--json"
-    )
-    assert code == 0, err
-    data = json.loads(out)
+    options = ("--camera-kind", kind, "--camera", "cam", "--save")
+    code, data = answer_of(capsys, "calibrate", "import", str(path), *options)
+    assert code == 0, data["message"]
     assert off(data, known)[0] < 1e-3
     assert off(data, known)[0] < 4.0 * data["figures"]["sigma_translation"]
     assert set(data["left_out"]) >= {"REFINED", "TSAI", "PARK", "SHAH"}
@@ -66,13 +64,11 @@ def test_pose_pairs_of_other_tools_are_solved_and_stored_by_one_command(
 def test_the_kind_that_a_file_of_easy_handeye2_states_is_used_and_a_missing_one_asked_for(capsys, tmp_path) -> None:
     known = files.truth("to_hand")
     path = files.easy_handeye2(tmp_path / "a.samples", known, "eye_on_base")
-    code, out, _ = calibrate(capsys, "import", str(path), "--json")
+    code, data = answer_of(capsys, "calibrate", "import", str(path))
     assert code == 0
-    assert off(json.loads(out), known)[0] < 1e-5
+    assert off(data, known)[0] < 1e-5
     path = files.easy_handeye2(tmp_path / "b.samples", known)
-    code, _, err = calibrate(capsys, "import", str(path))
-    assert code == 2
-    assert "give --camera-kind eye_in_hand or eye_to_hand" in err
+    calibrate_fails(capsys, 2, "give --camera-kind eye_in_hand or eye_to_hand", "import", str(path))
 
 
 def info(path: Path, coefficients: np.ndarray | None = None) -> str:
@@ -105,9 +101,8 @@ def test_a_csv_and_a_folder_of_images_are_solved_with_the_convention_found(
         "--camera-kind", f"eye_{setup}", "--images", str(tmp_path / "images"), "--board", BOARD,
         "--intrinsics", info(tmp_path / "cam.yaml", lens), "--session", str(session),
     )  # fmt: skip
-    code, out, err = calibrate(capsys, "import", str(path), *argv, "--json")
-    assert code == 0, err
-    data = json.loads(out)
+    code, data = answer_of(capsys, "calibrate", "import", str(path), *argv)
+    assert code == 0, data["message"]
     assert off(data, known)[0] < 2e-4
     assert data["conventions"][0]["convention"].startswith(f"{frames}, ")
     assert data["conventions"][0]["convention"].endswith(f", {unit}")
@@ -201,8 +196,5 @@ HAND = ("--camera-kind", "eye_in_hand")
 def test_wrong_calls_and_hostile_files_end_in_a_sentence(capsys, made: Path, monkeypatch, argv, code, words) -> None:
     monkeypatch.chdir(made)
     before = sorted(made.iterdir())
-    got, out, err = calibrate(capsys, "import", *argv)
-    assert got == code, err
-    assert words in err
-    assert "Traceback" not in out + err
+    calibrate_fails(capsys, code, words, "import", *argv)
     assert sorted(made.iterdir()) == before
