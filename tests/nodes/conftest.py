@@ -105,23 +105,25 @@ class Bench:
     def call(self, kind: type, service: str, /, **fields: object):
         return self.ros.call(self.ros.node.create_client(kind, service), kind.Request(**fields))
 
+    def done(self, kind: type, service: str, /, **fields: object) -> None:
+        """Call a service that must succeed."""
+        answer = self.call(kind, service, **fields)
+        assert answer.success, answer.message
+
     def inject(self, name: str, parameters: str = "", seed: int = 1) -> None:
         from openarm_interfaces.srv import InjectFault
 
-        answer = self.call(InjectFault, "/sim/inject_fault", name=name, parameters=parameters, seed=seed)
-        assert answer.success, answer.message
+        self.done(InjectFault, "/sim/inject_fault", name=name, parameters=parameters, seed=seed)
 
     def clear(self, name: str = "") -> None:
         from openarm_interfaces.srv import ClearFaults
 
-        answer = self.call(ClearFaults, "/sim/clear_faults", name=name)
-        assert answer.success, answer.message
+        self.done(ClearFaults, "/sim/clear_faults", name=name)
 
     def reset(self, **fields: object) -> None:
         from openarm_interfaces.srv import ResetWorld
 
-        answer = self.call(ResetWorld, "/sim/reset_world", **fields)
-        assert answer.success, answer.message
+        self.done(ResetWorld, "/sim/reset_world", **fields)
 
     # --- actions
     @staticmethod

@@ -117,8 +117,7 @@ def test_objects_are_moved_and_removed(bench) -> None:
     names = set(objects())
     pose = PoseStamped()
     pose.pose.position.x, pose.pose.position.y = 0.45, 0.0
-    answer = bench.call(MoveObject, "/sim/move_object", name="red_cube", pose=pose)
-    assert answer.success, answer.message
+    bench.done(MoveObject, "/sim/move_object", name="red_cube", pose=pose)
     p = objects()["red_cube"]
     np.testing.assert_allclose([p.x, p.y, p.z], [0.45, 0.0, 0.425], atol=0.001)
     other = next(name for name in names if name != "red_cube")
@@ -129,7 +128,7 @@ def test_objects_are_moved_and_removed(bench) -> None:
     assert other in answer.message
     p = objects()["red_cube"]
     np.testing.assert_allclose([p.x, p.y, p.z], [0.45, 0.0, 0.425], atol=0.001)
-    assert bench.call(RemoveObject, "/sim/remove_object", name="red_cube").success
+    bench.done(RemoveObject, "/sim/remove_object", name="red_cube")
     assert set(objects()) == names - {"red_cube"}
     answer = bench.call(RemoveObject, "/sim/remove_object", name="red_cube")
     assert not answer.success

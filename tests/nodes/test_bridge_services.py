@@ -30,8 +30,7 @@ def test_pause_and_step(bench) -> None:
     n = len(bench.joints)
     bench.ros.spin_until(lambda: len(bench.joints) >= n + 3, what="signs of life")
     assert bench.t_ns == before
-    answer = bench.call(StepSimulation, "/sim/step", steps=203)
-    assert answer.success, answer.message
+    bench.done(StepSimulation, "/sim/step", steps=203)
     bench.ros.spin_until(lambda: bench.t_ns == before + 203 * 2_000_000, what="203 steps of 2 ms")
     assert not bench.call(StepSimulation, "/sim/step", steps=0).success
     assert bench.call(SetPause, "/sim/set_pause", paused=False).success
@@ -43,8 +42,7 @@ def test_reset_puts_the_robot_back_and_aborts_what_runs(bench) -> None:
     _, future = bench.follow(bench.goal((60.0, bench.NEAR_HOME)))
     bench.spin_sim(1.5)
     before = bench.t_ns
-    answer = bench.call(ResetWorld, "/sim/reset_world")
-    assert answer.success
+    bench.reset()
     assert "reset" in bench.ros.result(future).result.error_string
     bench.spin_sim(0.3)
     assert bench.t_ns > before
@@ -58,16 +56,13 @@ def test_reset_takes_a_keyframe_and_overrides(bench) -> None:
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
     pose = PoseStamped()
     pose.pose.position.x, pose.pose.position.y = 0.45, 0.30
-    answer = bench.call(
-        ResetWorld,
-        "/sim/reset_world",
+    bench.reset(
         keyframe="hands_up",
         joint_names=["openarm_right_joint7", bench.FINGER],
         joint_positions=[0.25, 0.03],
         object_names=["red_cube"],
         object_poses=[pose],
     )
-    assert answer.success, answer.message
     up = bench.node.description.group_state("right_arm", "hands_up")
     bench.ros.spin_until(lambda: abs(bench.arm[6] - 0.25) < 0.01, what="a joint state of the new posture")
     np.testing.assert_allclose(bench.arm, [*(up[name] for name in bench.ARM[:6]), 0.25], atol=0.01)
@@ -127,8 +122,7 @@ def test_a_diverged_world_takes_no_command_until_it_is_reset(bench, tmp_path, mo
 @pytest.mark.requirement("P-25")
 def test_another_scene_is_loaded_while_time_goes_on(bench) -> None:
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
-    answer = bench.call(ResetWorld, "/sim/reset_world", scene="random", seed=7)
-    assert answer.success, answer.message
+    bench.reset(scene="random", seed=7)
     bench.ros.spin_until(
         lambda: got and got[-1].objects and got[-1].objects[0].name != "red_cube", what="the new objects"
     )

@@ -42,11 +42,16 @@ def identify(bench, **options) -> Outcome:
         return done.result()
 
 
-def taken_over(bench, stored: StoredServos) -> None:
-    """Wait until the bridge carries the right arm by stored servos."""
+def taken_over(bench, done: Outcome) -> StoredServos:
+    """The servos of the right arm that were identified and stored, once the bridge carries the arm by them."""
+    assert done.success, done.message
+    assert "joint  gain, N m/rad" in done.text
+    stored = ServoStore(default_folder()).load("right")
+    assert stored.dynamics_seed == 7
     servos, expected = bench.node._face._servos, f"identified {stored.digest()[:12]}"
     bench.ros.spin_until(lambda: servos.sources["right"] == expected, what="the bridge to use them")
     assert servos.sources["left"] == "as configured"
+    return stored
 
 
 class KnownArm(DynamicsClient):
@@ -101,15 +106,11 @@ def test_known_servos_are_identified_stored_and_used(bridge, monkeypatch) -> Non
     monkeypatch.setattr(ros_dynamics, "DynamicsClient", KnownArm)
     bench = bridge(images=False, profile="openarm", openarm__dynamics_seed=7)
     done = dynamics(domain=int(os.environ["ROS_DOMAIN_ID"]), arm="right", postures=3)
-    assert done.success, done.message
-    assert "joint  gain, N m/rad" in done.text
-    stored = ServoStore(default_folder()).load("right")
-    assert stored.dynamics_seed == 7
+    stored = taken_over(bench, done)
     np.testing.assert_allclose(stored.stiffness, KnownArm.STIFFNESS, rtol=0.15)
     np.testing.assert_allclose(stored.friction, KnownArm.FRICTION, atol=0.25)
     np.testing.assert_allclose(stored.damping, KnownArm.DAMPING, rtol=0.3)
     np.testing.assert_allclose(stored.latency, KnownArm.LATENCY, atol=0.008)
-    taken_over(bench, stored)
 
 
 @pytest.mark.long
@@ -125,14 +126,10 @@ def test_servos_are_identified_stored_and_used(ros, bridge) -> None:
     finally:
         motion.terminate()
         motion.wait()
-    assert done.success, done.message
-    assert "joint  gain, N m/rad" in done.text
-    stored = ServoStore(default_folder()).load("right")
-    assert stored.dynamics_seed == 7
+    stored = taken_over(bench, done)
     made, names = drawn(HardwareConfig(dynamics_seed=7), bench.node.description), bench.ARM
     np.testing.assert_allclose(stored.stiffness, [made.stiffness[name] for name in names], rtol=0.15)
     np.testing.assert_allclose(stored.friction, [made.friction[name] for name in names], atol=0.25)
-    taken_over(bench, stored)
 
 
 def test_ideal_servos_are_not_identified(bench) -> None:

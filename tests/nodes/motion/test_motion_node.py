@@ -168,15 +168,9 @@ class WaitingPlanner:
         raise OpenArmError(Code.CANCELLED, "planning was stopped")
 
 
-def waiting_planner(bench) -> WaitingPlanner:
-    """Let the right arm ask one for every path."""
-    arm = bench.node.service.arms["right"]
-    arm._planner, arm.direct = WaitingPlanner(), False
-    return arm._planner
-
-
 def test_a_search_ends_by_cancel_and_with_the_node(bench) -> None:
-    planner = waiting_planner(bench)
+    arm, planner = bench.node.service.arms["right"], WaitingPlanner()
+    arm._planner, arm.direct = planner, False  # it is asked for every path
     for client, goal in ((bench.move_client, bench.named()), (bench.plan_client, approach_goal(bench))):
         planner.searching.clear()
         handle, future = bench.start(client, goal)
