@@ -58,9 +58,9 @@ def world() -> World:
 def robot() -> Callable[..., World]:
     """Makes a world in which each arm reaches its own side and a strip of the other's: x, y of the red cube, others."""
 
-    def make(x: float, y: float, *others: tuple[str, float, float], **config: Any) -> World:
+    def make(x: float, y: float, *others: tuple[str, float, float], far: float = 1.0, **config: Any) -> World:
         world = World(standing("red", x, y), *(standing(*other) for other in others), **config)
-        world.two_sided = True
+        world.two_sided, world.far = True, far
         return world
 
     return make

@@ -21,6 +21,7 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict
 from openarm_grasp.perception.detections import Frame, Sighting
 from openarm_grasp.perception.sightings import in_box
+from openarm_grasp.requests.task import Grasp
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from openarm_grasp.sampling.views import views_of
 from openarm_grasp.strategies import find, verify
@@ -78,20 +79,19 @@ def test_where_the_points_of_what_was_placed_are_is_remembered(recorded: Recordi
     assert robot.session.parts_of((elsewhere,)) == ((elsewhere,), ())
 
 
-def kept_banana(recorded: Recordings) -> tuple[Requests, str]:
-    """Pick the banana; returns the arm that holds it."""
+def kept_banana(recorded: Recordings) -> tuple[Requests, str, Grasp]:
+    """Pick the banana; returns the arm that holds it, and what it keeps."""
     robot = recorded(alone("banana", 0.27, -0.22, 0.4))
     robot.succeeds("anything", phase="pick")
-    (arm,) = robot.session.kept
-    return robot, arm
+    ((arm, kept),) = robot.session.kept.items()
+    return robot, arm, kept
 
 
 @pytest.mark.parametrize("in_part", [False, True])
 def test_the_map_around_the_hand_is_in_no_way_where_more_than_was_seen_hangs_in_it(
     recorded: Recordings, monkeypatch, in_part
 ) -> None:
-    robot, arm = kept_banana(recorded)
-    kept = robot.session.kept[arm]
+    robot, arm, kept = kept_banana(recorded)
     robot.session.kept[arm] = replace(kept, adjacent=(kept.sighting.target,) if in_part else ())
     plan, asked = robot.link.plan, list[PlanPlace]()
 
@@ -123,7 +123,7 @@ def test_among_other_things_the_place_is_planned_before_the_lift(recorded: Recor
 
 def test_one_image_that_shows_it_at_its_place_is_enough(recorded: Recordings, monkeypatch) -> None:
     """The newest of three shows only a part of it, as it may of a thin thing."""
-    robot, _ = kept_banana(recorded)
+    robot, _, _ = kept_banana(recorded)
     seen_in, asked = verify._seen_whole, list[int]()
 
     def in_part(frame: Frame, *args) -> CameraVerdict:
@@ -137,8 +137,7 @@ def test_one_image_that_shows_it_at_its_place_is_enough(recorded: Recordings, mo
 
 
 def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_that(recorded: Recordings) -> None:
-    robot, arm = kept_banana(recorded)
-    kept = robot.session.kept[arm]
+    robot, arm, kept = kept_banana(recorded)
     assert not kept.turned
     robot.session.kept[arm] = replace(kept, turned=True)
     outcome = robot.ask(phase="place")
@@ -147,8 +146,7 @@ def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_th
 
 
 def test_what_is_seen_away_from_its_target_is_not_said_to_be_placed(recorded: Recordings) -> None:
-    robot, arm = kept_banana(recorded)
-    kept = robot.session.kept[arm]
+    robot, arm, kept = kept_banana(recorded)
     shifted = se3.make(p=(0.0, 0.030, 0.0)) @ kept.candidate.T_base_tcp
     robot.session.kept[arm] = replace(kept, candidate=replace(kept.candidate, T_base_tcp=shifted))
     outcome = robot.ask(phase="place")
@@ -158,8 +156,7 @@ def test_what_is_seen_away_from_its_target_is_not_said_to_be_placed(recorded: Re
 
 @pytest.mark.long
 def test_what_was_seen_in_part_must_be_seen_within_half_of_what_counts_as_moved(recorded: Recordings) -> None:
-    robot, arm = kept_banana(recorded)
-    kept = robot.session.kept[arm]
+    robot, arm, kept = kept_banana(recorded)
     part = replace(kept.sighting, target=replace(kept.sighting.target, measured=False))
     shifted = se3.make(p=(0.0, 0.014, 0.0)) @ kept.candidate.T_base_tcp
     robot.session.kept[arm] = replace(kept, sighting=part, candidate=replace(kept.candidate, T_base_tcp=shifted))
@@ -171,8 +168,7 @@ def test_what_was_seen_in_part_must_be_seen_within_half_of_what_counts_as_moved(
 
 
 def test_what_has_gone_with_what_a_hand_keeps_may_be_a_part_of_it(recorded: Recordings) -> None:
-    robot, arm = kept_banana(recorded)
-    kept = robot.session.kept[arm]
+    robot, arm, kept = kept_banana(recorded)
     gone = replace(kept.sighting.target, T_base_object=se3.make(p=(0.27, -0.16, 0.42)), size=np.full(3, 0.03))
     robot.session.kept[arm] = replace(kept, adjacent=(gone,))
     outcome = robot.ask(phase="place")

@@ -18,8 +18,7 @@ from tests.openarm_grasp.scripted import Follow, Grip
 
 @pytest.mark.requirement("N-13", "A-65")
 def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(robot) -> None:
-    two = robot(0.46, 0.02)
-    two.far = 0.44
+    two = robot(0.46, 0.02, far=0.44)
     outcome = two.ask()
     assert (outcome.code, outcome.route) == (Code.OK, "push")
     assert two.pushed == 1
@@ -32,8 +31,7 @@ def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(robot) -> 
 
 @pytest.mark.requirement("N-13")
 def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_object_now(robot) -> None:
-    two = robot(0.46, 0.02)
-    two.far = 0.44
+    two = robot(0.46, 0.02, far=0.44)
     plan, ahead = two.plan, list[PlanGrasp]()
 
     async def noted(effect: PlanGrasp | PlanPlace) -> Planned:
@@ -52,8 +50,8 @@ def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_obj
 
 @pytest.mark.requirement("N-13")
 def test_a_push_that_the_object_does_not_follow_goes_another_way_next_and_is_reported(robot) -> None:
-    two = robot(0.46, 0.02)
-    two.far, two.follows = 0.44, 0.1
+    two = robot(0.46, 0.02, far=0.44)
+    two.follows = 0.1
     outcome = two.ask()
     assert two.pushed == 2  # no third way leads into reach
     first, second = (line[:2] / np.linalg.norm(line[:2]) for line in (two.lines[0], two.lines[-1]))
@@ -66,8 +64,8 @@ def test_a_push_that_the_object_does_not_follow_goes_another_way_next_and_is_rep
 @pytest.mark.requirement("N-13")
 def test_the_camera_verifies_a_push(robot) -> None:
     """Half of the way is seen as half of the way, and the rest is pushed again."""
-    two = robot(0.46, 0.02)
-    two.far, two.follows = 0.44, 0.5
+    two = robot(0.46, 0.02, far=0.44)
+    two.follows = 0.5
     outcome = two.ask()
     assert outcome.code is Code.OK
     assert two.pushed == 2
@@ -76,16 +74,14 @@ def test_the_camera_verifies_a_push(robot) -> None:
 
 @pytest.mark.requirement("N-13")
 def test_after_a_push_the_object_is_looked_for_where_it_was_pushed_to_not_where_the_request_said(robot) -> None:
-    two = robot(0.46, 0.02)
-    two.far = 0.40
+    two = robot(0.46, 0.02, far=0.40)
     outcome = two.ask(object_at=(0.46, 0.02))
     assert (outcome.code, outcome.route) == (Code.OK, "push"), outcome.message
 
 
 @pytest.mark.requirement("N-13")
 def test_an_object_that_is_lost_in_a_push_is_reported(robot) -> None:
-    two = robot(0.46, 0.02)
-    two.far = 0.44
+    two = robot(0.46, 0.02, far=0.44)
     push = two.push
     two.push = lambda: (push(), two.objects.pop("red"))
     outcome = two.ask()
@@ -94,16 +90,16 @@ def test_an_object_that_is_lost_in_a_push_is_reported(robot) -> None:
 
 
 def test_a_hand_that_meets_something_behind_the_object_does_not_push(robot) -> None:
-    two = robot(0.46, 0.02)
-    two.far, two.tcp_error = 0.44, 0.02
+    two = robot(0.46, 0.02, far=0.44)
+    two.tcp_error = 0.02
     outcome = two.ask()
     assert (outcome.kind, outcome.code) == ("FAILED", Code.HAND_COLLISION)
     assert two.pushed == 0
 
 
 def test_what_can_neither_be_grasped_nor_pushed_is_refused_with_both_reasons(robot) -> None:
-    two = robot(0.46, 0.02)
-    two.far, two.hands_come_behind = 0.44, False
+    two = robot(0.46, 0.02, far=0.44)
+    two.hands_come_behind = False
     outcome = two.ask()
     assert (outcome.kind, outcome.code) == ("REFUSED", Code.UNREACHABLE)
     assert "out of reach" in outcome.message
@@ -123,8 +119,7 @@ def test_what_is_thinner_than_the_hand_comes_down_to_can_not_be_pushed(robot, he
 
 @pytest.mark.requirement("N-13")
 def test_a_dry_run_of_a_push_moves_nothing(robot) -> None:
-    two = robot(0.46, 0.02)
-    two.far = 0.44
+    two = robot(0.46, 0.02, far=0.44)
     outcome = two.ask(dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "push")
     assert not two.done(Follow)

@@ -128,8 +128,7 @@ def test_the_easiest_object_is_not_pushed_for(pressed) -> None:
 
 
 def test_a_push_that_is_blocked_is_observed_all_the_same(robot) -> None:
-    two = robot(0.46, 0.02)
-    two.far = 0.44
+    two = robot(0.46, 0.02, far=0.44)
     follow = two.follow
 
     async def blocked(arm: str, trajectory: object, what: str, **kwargs) -> None:

@@ -102,6 +102,14 @@ class Bench:
             self.buses.take(bus, mine, self.now_ns) for bus, mine in zip(self.machine.buses, sent, strict=True)
         ]
 
+    def move(self, speed: float) -> None:
+        """Let the client move all joints at a speed, with their weights carried; the fingers stay."""
+        since, start = self.now_ns, [s.command for s in self.machine.motors()]
+        self.client = lambda: [
+            (q, 1.0) if a.grips else (q + speed * (self.now_ns - since) * 1e-9, weight)
+            for q, weight, a in zip(start, self.weights(), self.axes, strict=True)
+        ]
+
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
             self.tick()

@@ -165,11 +165,7 @@ def test_commands_beyond_the_limits_end_at_them() -> None:
 def test_a_frozen_encoder_is_found_when_the_arm_moves() -> None:
     bench = Bench().up()
     bench.buses.inject("freeze", "one_4")
-    since, start = bench.now_ns, [s.command for s in bench.machine.motors()]
-    bench.client = lambda: [
-        (q + (0.0 if a.grips else 0.5 * (bench.now_ns - since) * 1e-9), 1.0 if a.grips else 0.0)
-        for q, a in zip(start, bench.axes, strict=True)
-    ]
+    bench.move(0.5)
     bench.until([Phase.DAMPED, Phase.HELD], 0.3)
     assert "one_4" in bench.machine.text
     assert "is its encoder dead" in bench.machine.text
@@ -177,11 +173,7 @@ def test_a_frozen_encoder_is_found_when_the_arm_moves() -> None:
 
 def test_motors_that_are_not_heard_of_for_a_while_are_not_taken_for_dead_encoders() -> None:
     bench = Bench(silent=100, tracking=2.0).up()
-    since, start = bench.now_ns, [s.command for s in bench.machine.motors()]
-    bench.client = lambda: [
-        (q + (0.0 if a.grips else 1.0 * (bench.now_ns - since) * 1e-9), 1.0 if a.grips else 0.0)
-        for q, a in zip(start, bench.axes, strict=True)
-    ]
+    bench.move(1.0)
     for _ in range(4):
         bench.run(0.1)
         kept = list[list[Frame]]([[], []])
@@ -202,16 +194,13 @@ def test_motors_that_are_not_heard_of_for_a_while_are_not_taken_for_dead_encoder
 
 def test_a_joint_that_is_blocked_is_found_by_its_distance_from_the_command() -> None:
     bench = Bench(weight=0.0).up()
-    since, start = bench.now_ns, [s.command for s in bench.machine.motors()]
-    blocked = bench.motors[3]
+    bench.move(0.5)
+    blocked, command = bench.motors[3], bench.client
     stop = blocked.q
 
     def push() -> list[tuple[float, float]]:
         blocked.q, blocked.dq = stop + 1e-3 * math.sin(0.1 * bench.commands), 0.0  # the encoder lives
-        return [
-            (q + (0.0 if a.grips else 0.5 * (bench.now_ns - since) * 1e-9), 1.0 if a.grips else 0.0)
-            for q, a in zip(start, bench.axes, strict=True)
-        ]
+        return command()
 
     bench.client = push
     bench.until([Phase.HELD, Phase.HELD], 1.5)
@@ -270,11 +259,7 @@ def test_the_emergency_stop_holds_at_once_with_the_weight_carried() -> None:
     bench = Bench(weight=1.0)
     bench.client = bench.carried
     bench.up()
-    start, since = [s.command for s in bench.machine.motors()], bench.now_ns
-    bench.client = lambda: [
-        (q if a.grips else q + 0.5 * (bench.now_ns - since) * 1e-9, 1.0 if a.grips else w)
-        for q, w, a in zip(start, bench.weights(), bench.axes, strict=True)
-    ]
+    bench.move(0.5)
     bench.run(0.5)
     torque = [s.command_tau for s in bench.machine.motors()]
     stopped = bench.q()
