@@ -74,7 +74,6 @@ except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
 @pytest.fixture
 def peer():
     with subprocess.Popen([sys.executable, "-c", _PEER], stdout=subprocess.PIPE, text=True, env=os.environ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         yield process
         process.send_signal(signal.SIGINT)

@@ -143,7 +143,6 @@ def test_a_signal_lets_the_node_bring_to_rest_what_it_moves_while_the_graph_is_t
     def close(self):""".replace("\\\n", ""),
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=os.environ) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGTERM)
         out, _ = process.communicate(timeout=60.0)
@@ -159,7 +158,6 @@ def test_a_signal_ends_a_node_that_holds_an_arm_with_exit_code_0() -> None:
     )
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": os.environ}
     with subprocess.Popen([sys.executable, "-c", script], **pipes) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
         out, error = process.communicate(timeout=60.0)
@@ -172,8 +170,6 @@ def test_an_end_that_takes_too_long_is_located_by_a_second_signal() -> None:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": os.environ}
     with subprocess.Popen([sys.executable, "-c", script], **pipes) as process:
         try:
-            assert process.stdout is not None
-            assert process.stderr is not None
             assert process.stdout.readline() == "ready\n"
             process.send_signal(signal.SIGINT)
             assert process.stdout.readline() == "closing\n"

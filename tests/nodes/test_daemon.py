@@ -164,7 +164,6 @@ def test_both_ways_give_the_same_answer(
 def test_ctrl_c_and_the_end_of_a_client_end_what_it_asked_for(graph: Graph) -> None:
     for number, code in ((signal.SIGINT, 0), (signal.SIGKILL, -signal.SIGKILL)):
         echo = graph.start("topic", "echo", "/ticks")
-        assert echo.stdout is not None
         assert echo.stdout.readline() == "{data: tick}\n"
         assert graph.ticks.get_subscription_count() == 1
         echo.send_signal(number)

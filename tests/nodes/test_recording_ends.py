@@ -150,7 +150,6 @@ def killed_subscribers(ros) -> None:
             stack.callback(process.kill)
         *hear, _ = processes
         for process in hear:
-            assert process.stdout is not None
             assert process.stdout.readline(), "a word was heard"
         for process in hear:
             process.kill()
@@ -175,8 +174,6 @@ def test_what_comes_while_the_recorder_is_held_up_is_not_lost(tmp_path: Path) ->
         subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True) as recorder,
     ):
         try:
-            assert sender.stdin is not None
-            assert sender.stdout is not None
             assert sender.stdout.readline() == "met\n"
             recorder.send_signal(signal.SIGSTOP)
             print(file=sender.stdin, flush=True)

@@ -423,7 +423,6 @@ def test_the_guard_goes_up_its_ladder(monkeypatch: pytest.MonkeyPatch) -> None:
     node = subprocess.Popen(
         [sys.executable, "-S", "-c", f"import time; {STUBBORN}"], stdout=subprocess.PIPE, start_new_session=True
     )
-    assert node.stdout is not None
     assert node.stdout.readline() == b"deaf\n"
     guard.end({node.pid})
     node.communicate()
@@ -458,7 +457,6 @@ def test_children_end_when_the_supervisor_is_killed(tmp_path: Path, body: str) -
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=env)
     try:
-        assert process.stdout is not None
         word, *pids = process.stdout.readline().split()
         assert word == "up"
         assert len(pids) == 2

@@ -43,7 +43,6 @@ def test_it_prints_an_address_that_opens_and_ends_with_ctrl_c(tmp_path: Path) ->
     command = [sys.executable, "-m", "openarm_bringup.cli", "view", "--port", "0"]
     env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
     first = subprocess.Popen(command, env=env, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    assert first.stderr is not None
     try:
         printed = re.search(r"the page is at (http://127\.0\.0\.1:\d+/)#([\w-]{32})$", first.stderr.readline())
         assert printed is not None

@@ -42,7 +42,6 @@ def test_another_process_gets_another_domain_until_this_one_ends(three: list[int
     with subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
-        assert other.stdout is not None
         theirs = int(other.stdout.readline())
         ours = [reserve_domain(), reserve_domain()]
         assert sorted([*ours, theirs]) == three

@@ -21,7 +21,6 @@ CHILD = "import sys; from openarm_common.lifeline import Lifeline; l = Lifeline(
 def test_it_ends_when_the_process_is_killed() -> None:
     name, ended = uuid.uuid4().hex, threading.Event()
     with subprocess.Popen([sys.executable, "-c", CHILD, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
-        assert child.stdout is not None
         child.stdout.readline()
         assert watch(name, ended.set)
         assert not ended.wait(0.1)

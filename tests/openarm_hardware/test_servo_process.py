@@ -91,16 +91,13 @@ class Rig:
             if servo.alive:
                 os.kill(servo.pid, signal.SIGKILL)
             servo.close(5.0)
-        assert self._emulator.stdin is not None
         self._emulator.stdin.close()
         self._emulator.wait(GUARD_S)
 
     def _write(self, line: str) -> None:
-        assert self._emulator.stdin is not None
         self._emulator.stdin.write(line.encode())
 
     def _read(self) -> dict[str, Any]:
-        assert self._emulator.stdout is not None
         return json.loads(self._emulator.stdout.readline())
 
 
