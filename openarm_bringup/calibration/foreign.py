@@ -6,118 +6,155 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from openarm_bringup.calibration.foreign_options import NOTHING, Foreign, Format, lens_given
+from openarm_bringup.calibration.foreign_options import NOTHING, Foreign, lens_given
 from openarm_bringup.calibration.source import given_board, store_in
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
+    from openarm_calibration.foreign.explain import Poses
+    from openarm_calibration.foreign.pose_source import Column, Source
+    from openarm_calibration.handeye.problem import Setup
     from openarm_calibration.sampling.samples import SampleSet
 
-_ALLOWED: dict[str, tuple[str, ...]] = {
-    "easy_handeye2": ("base", "tip"),
-    "moveit": ("base", "tip"),
-    "csv": ("base", "tip", "board", "images", "intrinsics", "rotation", "unit", "frames", "session"),
-    "bag": ("base", "tip", "board", "intrinsics", "image_topic", "info_topic", "joint_topic", "urdf", "session"),
+_OF_BAGS = ("image_topic", "info_topic", "joint_topic", "urdf")
+_OF_VIEWS = ("board", "images", "intrinsics", "session")
+_OF_PAIRS = ("board_rotation", "board_unit", "board_frames", "fix")
+_OF_POSES = ("with_", "columns", "rotation", "unit", "frames")
+_NOT_OF: dict[str, tuple[str, ...]] = {
+    "a bag": (*_OF_POSES, *_OF_PAIRS, "images"),
+    "pairs of poses": (*_OF_BAGS, *_OF_VIEWS),
+    "poses and images": (*_OF_BAGS, *_OF_PAIRS),
 }
 
 
-def format_of(path: Path) -> str:
-    """Return the format of a file by its name and its beginning.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, when it is missing; CONFIG_INVALID, when it is nothing that is known.
-    """
-    if not path.exists():
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no {path}")
-    if path.is_dir() or path.suffix == ".mcap":
-        return "bag"
-    if path.suffix in (".csv", ".tsv", ".txt"):
-        return "csv"
-    from openarm_common.config import parse_json, parse_yaml, read_text
-
-    text = read_text(path)
-    document = (
-        parse_json(text, str(path), Code.CONFIG_INVALID) if path.suffix == ".json" else parse_yaml(text, str(path))
-    )
-    if isinstance(document, dict) and "samples" in document:
-        return "easy_handeye2"
-    if isinstance(document, list):
-        return "moveit"
-    raise OpenArmError(
-        Code.CONFIG_INVALID,
-        f"{path} is no samples of easy_handeye2 (a mapping with `samples`) or moveit_calibration (a list), no .csv and"
-        " no bag",
-    )
-
-
-def imported(path: Path, form: Format, given: Foreign) -> Outcome:
+def imported(path: Path, given: Foreign) -> Outcome:
     """Read, solve and, if asked to, store.
 
     Args:
-        path: File or bag.
-        form: Format; auto: by the file.
+        path: File, folder or bag.
         given: Options of the command line.
 
     Raises:
         OpenArmError: What is wrong with file or options; DEGENERATE, when the poses determine nothing.
     """
-    chosen = format_of(path) if form == "auto" else form
-    every = sorted({name for names in _ALLOWED.values() for name in names})
-    wrong = [name for name in every if name not in _ALLOWED[chosen] and getattr(given, name) != getattr(NOTHING, name)]
-    if wrong:
+    from openarm_calibration.foreign.pose_source import read_source
+
+    if not path.exists():
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no {path}")
+    if path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists():
+        _refuse(given, "a bag")
+        return _of_bag(path, given)
+    source = read_source(path, given.with_, given.columns)
+    if source.board is not None and given.images is None:
+        _refuse(given, "pairs of poses")
+        return _of_pairs(path, source, given)
+    if source.corners is None and given.images is None:
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
-            f"--{wrong[0].replace('_', '-')} is no option of the format {chosen}; its options:"
-            f" {', '.join('--' + name.replace('_', '-') for name in _ALLOWED[chosen])}",
+            f"{path} has poses of the robot alone ({source.robot.name!r}, {len(source.robot.rows)}); give --images"
+            " FOLDER with --board and --intrinsics, or --with FILE, which has the board's poses or corners",
         )
-    if chosen in ("easy_handeye2", "moveit"):
-        return _of_pairs(path, chosen, given)
-    if chosen == "csv":
-        return _of_csv(path, given)
-    return _of_bag(path, given)
+    _refuse(given, "poses and images")
+    return _of_views(path, source, given)
 
 
-def _of_pairs(path: Path, form: str, given: Foreign) -> Outcome:
+def _refuse(given: Foreign, what: str) -> None:
+    """Refuse options that are of something else."""
+    wrong = [name for name in _NOT_OF[what] if getattr(given, name) != getattr(NOTHING, name)]
+    if wrong:
+        every = {name for names in _NOT_OF.values() for name in names} - {*_NOT_OF[what]}
+        listed = ", ".join(sorted(_option(name) for name in every))
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{_option(wrong[0])} is no option for {what}; options: {listed}")
+
+
+def _option(name: str) -> str:
+    return f"--{name.strip('_').replace('_', '-')}"
+
+
+def _stated(column: Column, frames: str, given: tuple[str, Any, str | None], inverse: bool) -> Poses:
+    """Return poses with what the command line or the file says of them."""
+    from openarm_calibration.foreign.conventions import checked_form
+    from openarm_calibration.foreign.explain import Poses
+
+    rotation, unit, direction = given
+    rotation = checked_form(rotation or column.rotation) if rotation or column.rotation else ""
+    inverse = direction != frames if direction else inverse
+    said: Any = unit or column.unit or None
+    return Poses(column.rows, frames, rotation, said, inverse, column.labels)
+
+
+def _robot(source: Source, given: Foreign, setup: Setup) -> Poses:
+    """Return the robot's poses; easy_handeye2 writes those for a fixed camera the other way round."""
+    from openarm_calibration.foreign.explain import ROBOT_FRAMES
+    from openarm_calibration.foreign.pose_source import EASY_HANDEYE2
+
+    inverse = setup == "to_hand" if source.robot.name == EASY_HANDEYE2 else source.robot.inverse("robot")
+    return _stated(source.robot, ROBOT_FRAMES, (given.rotation, given.unit, given.frames), inverse)
+
+
+def _of_pairs(path: Path, source: Source, given: Foreign) -> Outcome:
+    from openarm_calibration.foreign.explain import BOARD_FRAMES, KIND, decided, search, table
     from openarm_calibration.foreign.image_sets import Names
     from openarm_calibration.foreign.pair_result import pair_result
-    from openarm_calibration.foreign.pose_files import read_easy_handeye2, read_moveit
+    from openarm_calibration.foreign.pose_source import EASY_HANDEYE2, KINDS, kind_of
+    from openarm_calibration.handeye.pose_pairs import PosePairs
     from openarm_common.records import now
 
-    read = read_easy_handeye2 if form == "easy_handeye2" else read_moveit
-    file = read(path, given.camera_kind or "")
-    names = Names(given.camera, given.base or file.base or "base", given.tip or file.tip or "tip")
-    result = pair_result(file.pairs, names, created=now())
+    assert source.board is not None
+    of_board = (given.board_rotation, given.board_unit, given.board_frames)
+    board = _stated(source.board, BOARD_FRAMES, of_board, source.board.inverse("board"))
+    kind = given.camera_kind or source.kind
+    if kind not in KINDS:
+        tried = search(_robot(source, given, "in_hand"), board, ("in_hand", "to_hand"))
+        # which of the two the poses tell where their direction is known
+        told = tried[0].fits and source.robot.name != EASY_HANDEYE2
+        fits = f": {tried[0].text} leaves {tried[0].left}" if told else ""
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"{path} does not say whether the hand carries the camera; give --camera-kind eye_in_hand or"
+            f" eye_to_hand{fits}",
+        )
+    setup = kind_of(kind, str(path))
+    labels = source.robot.labels
+    robot = _robot(source, given, setup)
+    tried = search(robot, board, (setup,))
+    chosen = decided(tried, (setup,), robot, board)
+    A, C = chosen.robot.poses(source.robot.rows), chosen.board.poses(source.board.rows)
+    assert A is not None  # both were tried
+    assert C is not None
+    C[:, :3, 3] *= chosen.scale
+    names = Names(
+        given.camera, given.base or source.frames.get("base") or "base", given.tip or source.frames.get("tip") or "tip"
+    )
+    result = pair_result(PosePairs(setup, A, C, labels), names, created=now(), fixed=given.fixed, scale=chosen.scale)
     message = f"{result.grade}: {'; '.join(result.reasons) or 'within all limits'}"
-    data = {"format": form, **result.as_json()}
+    if source.kind in KINDS and KINDS[source.kind] != setup:
+        message += f" ({path} says {source.kind}; the poses say {KIND[setup]})"
+    data = {"format": "pairs", "conventions": [one.as_json() for one in tried], **result.as_json()}
+    text = f"{table(tried[:1])}\n\n{result.text}"
     if result.grade == "fail":
         kept = "; not stored" if given.save else ""
-        return Outcome(False, message + kept, Code.DEGENERATE, data, result.text)
+        return Outcome(False, message + kept, Code.DEGENERATE, data, text)
     if given.save:
         stored = store_in(given.store).save(result.calibration)
-        return Outcome(True, f"{message}. Stored in {stored}", data=data | {"stored": str(stored)}, text=result.text)
-    return Outcome(True, message, data=data, text=result.text)
+        return Outcome(True, f"{message}. Stored in {stored}", data=data | {"stored": str(stored)}, text=text)
+    return Outcome(True, message, data=data, text=text)
 
 
-def _of_csv(path: Path, given: Foreign) -> Outcome:
-    from openarm_calibration.foreign.image_sets import Given, Names, image_set
-    from openarm_calibration.foreign.pose_files import kind_of, read_table
+def _of_views(path: Path, source: Source, given: Foreign) -> Outcome:
+    from openarm_calibration.foreign.image_sets import Names, image_set
+    from openarm_calibration.foreign.pose_source import kind_of
 
-    setup = kind_of(given.camera_kind or "", "a CSV")
-    for name, value in (("images", given.images), ("board", given.board), ("intrinsics", given.intrinsics)):
+    setup = kind_of(given.camera_kind or source.kind, str(path))
+    for name, value in (("board", given.board), ("intrinsics", given.intrinsics)):
         if not value:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"a CSV of poses needs --{name}; it has none of its own")
-    assert given.images is not None
-    found = image_set(
-        read_table(path), given.images, given_board(given.board), lens_given(given.intrinsics), setup,
-        Names(given.camera, given.base or "base", given.tip or "tip"),
-        Given(given.rotation, given.unit, given.frames),
-    )  # fmt: skip
-    tried = [
-        {"convention": one.convention.text, "translation": one.translation, "rotation": one.rotation}
-        for one in found.tried
-    ]
-    return _solved(found.samples, given, found.text, {"format": "csv", "images": found.rows, "conventions": tried})
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"poses with images or corners need --{name}; {path} has none")
+    board, lens = given_board(given.board), lens_given(given.intrinsics)
+    names = Names(given.camera, given.base or "base", given.tip or "tip")
+    found = image_set(source, given.images, board, lens, _robot(source, given, setup), setup, names)
+    tried = [one.as_json() for one in found.tried]
+    return _solved(found.samples, given, found.text, {"format": "views", "images": found.rows, "conventions": tried})
 
 
 def _of_bag(path: Path, given: Foreign) -> Outcome:

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -14,9 +15,8 @@ from openarm_common.errors import Code, OpenArmError
 if TYPE_CHECKING:
     from openarm_calibration.foreign.optics import Lens
 
-Format = Literal["auto", "easy_handeye2", "moveit", "csv", "bag"]
 CameraKind = Literal["eye_in_hand", "eye_to_hand"]
-Rotation = Literal["xyzw", "wxyz", "rotvec", "rotvec_deg", "rpy", "rpy_deg", "abc_deg", "matrix"]
+Unit = Literal["m", "cm", "mm", "inch"]
 
 
 @Parameter(name="*")
@@ -30,12 +30,21 @@ class Foreign:
         camera: Name of the camera in the result.
         base: Base frame of the robot.
         tip: Link that carries the camera, or the board.
-        board: Of images: the board, such as charuco:7x5:34mm:26mm:DICT_6X6_250, its keys as YAML, or a YAML file.
-        images: Of a CSV: folder of the images.
-        intrinsics: Of images: camera_info YAML, or WIDTH,HEIGHT,FX,FY,CX,CY. A bag has its own.
-        rotation: Of a CSV: xyzw, wxyz, rotvec, rotvec_deg, rpy, rpy_deg, abc_deg or matrix; found when not given.
-        unit: Of a CSV: of positions; found when not given.
-        frames: Of a CSV: T_base_tip is the pose of the tip in the base, T_tip_base the inverse; found when not given.
+        with_: Second file, of the board's poses or corners, where the first has those of the robot alone.
+        columns: Names of a table's columns, such as "image x y z qx qy qz qw" (rx ry rz, roll pitch yaw, m00 to m33);
+            robot_x, board_x, ... of pairs, - for one to leave out.
+        board: Of images and corners: the board, such as charuco:7x5:34mm:26mm:DICT_6X6_250, its keys, or a YAML file.
+        images: Folder of images, one for each pose.
+        intrinsics: Of images and corners: camera_info YAML, or WIDTH,HEIGHT,FX,FY,CX,CY. A bag has its own.
+        rotation: Robot's rotations: xyzw, wxyz, matrix, columns, rotvec, rpy, abc, or axes such as XYZ (moving) or zyz
+            (fixed), with _deg for degrees; found when not given.
+        unit: Unit of the robot's positions; found when not given.
+        frames: T_base_tip is the pose of the tip in the base (when not given), T_tip_base the inverse.
+        board_rotation: Rotations of the board's poses, as --rotation.
+        board_unit: Unit of the board's positions.
+        board_frames: T_camera_board is the pose of the board in the camera (when not given), T_board_camera the
+            inverse.
+        fix: Place of the camera along an axis of its parent, such as z=0.12 (m): an arm of four axes does not tell it.
         image_topic: Of a bag: Image or CompressedImage; the only one when not given.
         info_topic: Of a bag: CameraInfo; that next to the images when not given.
         joint_topic: Of a bag: JointState; /joint_states when not given; "tf" takes the pose of the tip from /tf.
@@ -49,12 +58,18 @@ class Foreign:
     camera: str = "camera"
     base: str = ""
     tip: str = ""
+    with_: Annotated[Path | None, Parameter(name="--with")] = None
+    columns: str = ""
     board: str = ""
     images: Path | None = None
     intrinsics: str = ""
-    rotation: Rotation | None = None
-    unit: Literal["m", "mm"] | None = None
+    rotation: str = ""
+    unit: Unit | None = None
     frames: Literal["T_base_tip", "T_tip_base"] | None = None
+    board_rotation: str = ""
+    board_unit: Unit | None = None
+    board_frames: Literal["T_camera_board", "T_board_camera"] | None = None
+    fix: str = ""
     image_topic: str = ""
     info_topic: str = ""
     joint_topic: str = ""
@@ -62,6 +77,20 @@ class Foreign:
     session: Path | None = None
     store: Path | None = None
     save: bool = False
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """Places that are given by `fix`, m.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when it is something else.
+        """
+        if not self.fix:
+            return {}
+        found = re.fullmatch(r"([xyz])=(-?\d*\.?\d+)", self.fix)
+        if found is None:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"--fix {self.fix}: expected an axis and metres, such as z=0.12")
+        return {found[1]: float(found[2])}
 
 
 NOTHING = Foreign()

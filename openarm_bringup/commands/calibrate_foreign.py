@@ -7,20 +7,22 @@ from pathlib import Path
 from typing import Literal
 
 from openarm_bringup.calibration.foreign import imported
-from openarm_bringup.calibration.foreign_options import NOTHING, Foreign, Format
+from openarm_bringup.calibration.foreign_options import NOTHING, Foreign
 from openarm_bringup.calibration.source import store_in
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
 
-def import_(source: Path, *, format: Format = "auto", given: Foreign = NOTHING) -> Outcome:
-    """Solve data of another tool or robot: samples of easy_handeye2 or moveit_calibration, a CSV and images, a bag.
+def import_(source: Path, *, given: Foreign = NOTHING) -> Outcome:
+    """Solve data of another tool or robot: pairs of poses, poses with images or corners, or a bag.
+
+    Read are samples of easy_handeye2 and moveit_calibration; YAML, JSON, OpenCV's FileStorage, .npz and .npy with poses
+    in any usual form; tables (CSV, TUM, text); a folder with a file for each pose; rosbag2 and MCAP.
 
     Args:
-        source: File of samples or poses, or a bag (folder of rosbag2, or MCAP file).
-        format: By the file's name and content when not given.
+        source: File, folder or bag.
     """
-    return imported(source, format, given)
+    return imported(source, given)
 
 
 def export(

@@ -48,10 +48,10 @@ _BENT = 0.4
 #: Directions about a circle, opposite ones as one, and of each the spread of the rim (2, 2).
 _HALF_TURN = 12
 _ANGLES = (np.arange(_HALF_TURN) + 0.5) * np.pi / _HALF_TURN
-_RIM: Array = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
-_SPREAD: Array = _RIM[:, :, None] * _RIM[:, None, :]
+_RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+_SPREAD = _RIM[:, :, None] * _RIM[:, None, :]
 #: Middles of the parts of a pixel, (n, 2) from its own.
-_PARTS: Array = (np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) - 1.5) / 4.0
+_PARTS = (np.stack(np.meshgrid(np.arange(4.0), np.arange(4.0)), axis=-1).reshape(-1, 2) - 1.5) / 4.0
 #: Most steps to a circle, and the last one, in radii.
 _ROUNDS, _STILL = 8, 1e-3
 
@@ -99,7 +99,7 @@ def _centre(image: Grey, start: Array, ellipse: Array) -> Array | None:
     u, v = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
     places = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
     grey = image[low[1] : high[1], low[0] : high[0]].ravel().astype(np.float64)
-    to_circle: Array = np.linalg.inv(ellipse)
+    to_circle = np.linalg.inv(ellipse).astype(np.float64)
     # white as a plane of grey: light may fall unevenly
     columns = np.column_stack([np.ones(len(places)), places - start])
     centre = start

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples from a folder of images and a table of poses: the board is found, the convention of the poses is found."""
+"""Samples from images, or corners in them, and poses of a robot: board and convention of the poses are found."""
 
 from __future__ import annotations
 
 import io
 import re
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_calibration.board.board import Board
+from openarm_calibration.board.circles import SymmetricCircles
 from openarm_calibration.board.detect import detect, guess_pose
-from openarm_calibration.board.detection import BoardDetection
-from openarm_calibration.foreign.conventions import Convention, Tried, candidates, guess, is_ambiguous, table
+from openarm_calibration.board.detection import BoardDetection, plane_fit
+from openarm_calibration.board.orientation import fronts, upright
+from openarm_calibration.board.squares import Chessboard
+from openarm_calibration.foreign.conventions import Convention
+from openarm_calibration.foreign.explain import BOARD_FRAMES, Poses, Tried, decided, search, table
 from openarm_calibration.foreign.optics import Lens
-from openarm_calibration.foreign.pose_files import Table
 from openarm_calibration.foreign.pose_robot import joints_of_pose, robot_of_poses
+from openarm_calibration.foreign.pose_source import Source
 from openarm_calibration.handeye.problem import Setup
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common.config import validate
@@ -41,20 +46,12 @@ class Names:
 
 
 @dataclass(frozen=True)
-class Given:
-    """What is known of the convention of the poses; None: to be found."""
-
-    rotation: Any = None
-    unit: Any = None
-    frames: Any = None
-
-
-@dataclass(frozen=True)
 class ImageSet:
-    """Samples of images, the conventions that were tried, and what became of each image."""
+    """Samples of images or corners, the conventions that were tried, and what became of each image."""
 
     samples: SampleSet
     tried: tuple[Tried, ...]
+    chosen: Tried
     rows: list[dict[str, Any]]
 
     @property
@@ -120,34 +117,44 @@ def found_in(board: Board, image: NDArray[np.uint8], lens: Lens) -> tuple[BoardD
     return detection, guess_pose(board.points[seen.ids], detection.pixels, board.radius, lens.intrinsics)[0]
 
 
+#: A view: which pose, the marks without distortion, T_camera_board (4, 4), and the rectified image as PNG.
+_View = tuple[int, BoardDetection, Array, bytes]
+
+
 def image_set(
-    poses: Table, folder: Path, board: Board, lens: Lens, setup: Setup, names: Names, given: Given
+    source: Source, folder: Path | None, board: Board, lens: Lens, robot: Poses, setup: Setup, names: Names
 ) -> ImageSet:
-    """Make samples of images and poses.
+    """Make samples of images, or of corners, and poses.
 
     Args:
-        poses: Of the robot, one for each image.
-        folder: Of the images; in the order of their names where the table has no names.
+        source: Poses of the robot, one for each image, and corners where there are no images.
+        folder: Of the images; in the order of their names where the source has no names.
         board: In the images.
         lens: Of the camera.
+        robot: The same poses, and what is stated of them.
         setup: in_hand or to_hand.
         names: Of camera and frames.
-        given: What is known of the poses.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when images and poses do not fit together; DEGENERATE, with too few boards, or
-            when several conventions explain the poses.
+            when no convention, or several, explain the poses.
     """
-    files = _files(poses, folder)
-    choices = candidates(poses.rows, given.rotation, given.unit, given.frames)
+    if folder is not None:
+        files = _files(source, folder)
+        looks = [(file.name, partial(_look, file, board, lens)) for file in files]
+    else:
+        assert source.corners is not None
+        corners = source.corners
+        looks = [
+            (label, partial(_marks, corners.rows[k], label, board, lens)) for k, label in enumerate(corners.labels)
+        ]
     rows: list[dict[str, Any]] = []
-    found: list[tuple[int, BoardDetection, Array, bytes]] = []
-    for k, file in enumerate(files):
-        row = {"image": file.name, "sample": "", "reason": ""}
+    found: list[_View] = []
+    for k, (name, look) in enumerate(looks):
+        row = {"image": name, "sample": "", "reason": ""}
         try:
-            image = image_of(file, lens)
-            detection, C = found_in(board, image, lens)
-            found.append((k, detection, C, cv2.imencode(".png", lens.rectified(image))[1].tobytes()))
+            detection, C, png = look()
+            found.append((k, detection, C, png))
             row["sample"] = f"s{len(found):03d}"
         except OpenArmError as error:
             row["reason"] = error.message
@@ -156,27 +163,47 @@ def image_set(
         why = next((str(row["reason"]) for row in rows if row["reason"]), "")
         raise OpenArmError(
             Code.DEGENERATE,
-            f"too few poses: the board is in {len(found)} of {len(files)} images, at least 3 are needed"
+            f"too few poses: the board is in {len(found)} of {len(looks)} images, at least 3 are needed"
             + (f"; such as: {why}" if why else ""),
         )
     kept = [k for k, *_ in found]
-    tried = guess(poses.rows[kept], np.array([C for _, _, C, _ in found]), setup, choices)
-    if is_ambiguous(tried):
+    seen = np.array([C for _, _, C, _ in found])
+    poses_of_board = Poses(seen.reshape(-1, 16), BOARD_FRAMES, "matrix", "m")
+    used = replace(robot, rows=robot.rows[kept], names=tuple(rows[k]["image"] for k in kept))
+    tried = search(used, poses_of_board, (setup,))
+    chosen = decided(tried, (setup,), used, poses_of_board)
+    samples = _samples(found, chosen.robot, robot.rows, board, lens, setup, names)
+    return ImageSet(samples, tried, chosen, rows)
+
+
+def _look(file: Path, board: Board, lens: Lens) -> tuple[BoardDetection, Array, bytes]:
+    """Return the marks in an image, T_camera_board (4, 4), and the rectified image."""
+    image = image_of(file, lens)
+    detection, C = found_in(board, image, lens)
+    return detection, C, cv2.imencode(".png", lens.rectified(image))[1].tobytes()
+
+
+def _marks(corners: Array, label: str, board: Board, lens: Lens) -> tuple[BoardDetection, Array, bytes]:
+    """Return the marks of a list of corners (m, 2) px, in the order of the board or the other way round."""
+    if len(corners) != len(board.points):
         raise OpenArmError(
-            Code.DEGENERATE,
-            f"{tried[0].convention.text} and {tried[1].convention.text} explain the poses about as well; give"
-            f" --rotation, --unit or --frames, or more images\n{table(tried)}",
+            Code.NOTHING_DETECTED, f"{label} has {len(corners)} corners, {board.label} has {len(board.points)}"
         )
-    samples = _samples(found, tried[0].convention, poses, board, lens, setup, names)
-    return ImageSet(samples, tried, rows)
+    pixels = lens.undistorted(corners)
+    if isinstance(board, Chessboard | SymmetricCircles):
+        plane, (rows, columns) = board.points[:, :2], (board.rows, board.columns)
+        by_columns = np.ascontiguousarray(pixels.reshape(columns, rows, 2).transpose(1, 0, 2).reshape(-1, 2))
+        listed = min(pixels, by_columns, key=lambda order: plane_fit(plane, fronts(plane, order, rows, columns)[0])[0])
+        pixels = upright(fronts(plane, listed, rows, columns), rows, columns)
+    T, residual = guess_pose(board.points, pixels, board.radius, lens.intrinsics)
+    return BoardDetection(np.arange(len(pixels)), pixels, residual), T, b""
 
 
 def _samples(
-    found: list[tuple[int, BoardDetection, Array, bytes]], convention: Convention, poses: Table, board: Board,
-    lens: Lens, setup: Setup, names: Names,
+    found: list[_View], convention: Convention, rows: Array, board: Board, lens: Lens, setup: Setup, names: Names
 ) -> SampleSet:  # fmt: skip
     """Return the samples, whose robot is that of poses."""
-    A = convention.poses(poses.rows)
+    A = convention.poses(rows)
     assert A is not None  # it was tried
     in_hand = setup == "in_hand"
     head = {
@@ -195,7 +222,7 @@ def _samples(
     return samples
 
 
-def _files(poses: Table, folder: Path) -> list[Path]:
+def _files(source: Source, folder: Path) -> list[Path]:
     """Return the image of each pose."""
     if not folder.is_dir():
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--images {folder} is no folder")
@@ -203,16 +230,17 @@ def _files(poses: Table, folder: Path) -> list[Path]:
         (path for path in folder.iterdir() if path.suffix.lower() in IMAGES and path.is_file()),
         key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)],
     )
-    if not poses.names:
-        if len(there) != len(poses.rows):
+    count = len(source.robot.rows)
+    if not source.images:
+        if len(there) != count:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,
-                f"{folder} has {len(there)} images for {len(poses.rows)} poses; expected as many, in the order of their"
+                f"{folder} has {len(there)} images for {count} poses; expected as many, in the order of their"
                 " names, or the name of its image in each line of the table",
             )
         return there
     by_name = {path.name: path for path in there} | {path.stem: path for path in there}
-    wanted = [Path(name).name for name in poses.names]
+    wanted = [Path(name).name for name in source.images]
     missing = [name for name in wanted if name not in by_name]
     if missing:
         raise OpenArmError(

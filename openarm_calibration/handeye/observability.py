@@ -57,6 +57,11 @@ class Motion:
     axis: Array
     least: str
 
+    @property
+    def one_axis(self) -> bool:
+        """Whether it turned about one axis only, and moved across it."""
+        return self.rotation >= _NO_ROTATION and self.second < _NO_SECOND_AXIS
+
 
 def motion(A: Array) -> Motion:
     """Describe the motion of robot poses A (n, 4, 4)."""
@@ -113,9 +118,9 @@ def motion_fault(seen: Motion) -> str:
             f"pure translation: the {seen.poses} poses turn by {degrees:.2f}° at most, so the offset of the camera is"
             " not determined; rotate the hand by 30° or more about two different axes"
         )
-    if seen.second < _NO_SECOND_AXIS:
+    if seen.one_axis:
         return (
-            f"one rotation axis: all rotations (up to {degrees:.0f}°) are about the gripper's {_name(seen.axis)};"
+            f"one rotation axis: all rotations (up to {degrees:.0f}°) are about the gripper's {axis_name(seen.axis)};"
             f" rotate by 15° or more about a second axis, such as {_other(seen.axis)}"
         )
     return ""
@@ -171,7 +176,7 @@ def _degenerate(seen: Motion, noise: Noise, what: str) -> OpenArmError:
         advice = "rotate the hand by 30° or more between samples, about two different axes"
     elif seen.second < _SMALL_SECOND_AXIS:
         across = math.degrees(seen.second)
-        cause = f"nearly one rotation axis (up to {across:.1f}° across the gripper's {_name(seen.axis)})"
+        cause = f"nearly one rotation axis (up to {across:.1f}° across the gripper's {axis_name(seen.axis)})"
         advice = f"rotate by 15° or more about {_other(seen.axis)} too"
     elif seen.poses < 6:
         cause = f"too few poses ({seen.poses})"
@@ -190,7 +195,8 @@ def _degenerate(seen: Motion, noise: Noise, what: str) -> OpenArmError:
     return OpenArmError(Code.DEGENERATE, f"{cause}: {what}; {advice}")
 
 
-def _name(axis: Array) -> str:
+def axis_name(axis: Array) -> str:
+    """Return the name of a direction (3,), such as `z axis`."""
     k = int(np.argmax(np.abs(axis)))
     if abs(axis[k]) > math.cos(math.radians(20.0)):
         return f"{'xyz'[k]} axis"

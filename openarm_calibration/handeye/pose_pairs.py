@@ -10,6 +10,7 @@ does not say. m, rad.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from openarm_calibration.handeye.closed_form import METHODS, REFINED, closed_form
-from openarm_calibration.handeye.observability import FEWEST, motion, motion_fault
+from openarm_calibration.handeye.consensus import Consensus, agreed
+from openarm_calibration.handeye.observability import FEWEST, axis_name, motion, motion_fault
 from openarm_calibration.handeye.problem import Setup, inverses, moved, skews
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.unknowns import invert_scaled
@@ -31,6 +33,12 @@ _LEAST = (1e-7, 1e-7)
 #: With fewer pairs none is left out; and never more than this share.
 _FEWEST_TO_REJECT, _MOST_REJECTED = 7, 0.25
 _FALSE_ALARM = 1e-3
+#: Of the deviation by medians: farther pairs are left out at first.
+_FAR = 5.0
+#: No answer about one axis is as unsure, rad.
+_UNSURE = 0.2
+#: A position that is given counts as sure to this, m; it must lie within so much of the free direction (cosine).
+_GIVEN, _ALONG = 1e-6, 0.3
 #: By how much a closed form must predict left-out pairs better to be taken instead.
 _BETTER = 0.95
 
@@ -83,6 +91,7 @@ class PairSolution:
         left_out: Prediction of left-out pairs by method; what a method fails with is its message.
         method: Whose X and Z these are: the refinement unless a closed form predicts better.
         distance: (n,) squared distance of each pair over its expectation.
+        free: (3,) direction along which the camera may be anywhere; zero where the pairs determine it.
     """
 
     X: Array
@@ -93,6 +102,7 @@ class PairSolution:
     left_out: dict[str, LeftOut | str]
     method: str
     distance: Array
+    free: Array
 
     @property
     def sigma(self) -> tuple[float, float]:
@@ -108,6 +118,14 @@ class _Fit:
     noise: tuple[float, float]
 
 
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """A position of the camera along a direction (3,), m, that the pairs do not tell."""
+
+    along: Array
+    at: float
+
+
 def residuals(pairs: PosePairs, X: Array, Z: Array) -> Array:
     """Return (n, 6): how far each board is from where X and Z predict it, m at the board and rad."""
     T = se3.inverse(X) @ pairs.B @ Z
@@ -115,39 +133,50 @@ def residuals(pairs: PosePairs, X: Array, Z: Array) -> Array:
     return np.hstack([pairs.C[:, :3, 3] - T[:, :3, 3], Rotation.from_matrix(turned).as_rotvec()])
 
 
-def solve_pairs(pairs: PosePairs) -> PairSolution:
+def solve_pairs(pairs: PosePairs, fixed: Mapping[str, float] | None = None) -> PairSolution:
     """Solve for the mounts, leave out pairs that the others contradict, and compare with closed forms.
+
+    Where all rotations are about one axis (an arm of four axes) five numbers of the camera's mount are determined.
+
+    Args:
+        pairs: Of one camera and board.
+        fixed: Position of the camera along an axis of its parent, `x`, `y` or `z`, m, where the pairs do not tell it.
 
     Raises:
         OpenArmError: DEGENERATE, when the poses do not determine the mounts, with the cause and what to add;
-            INVALID_ARGUMENT, for numbers that are not finite.
+            INVALID_ARGUMENT, for numbers that are not finite, or what is fixed and must not be.
     """
     if not (np.isfinite(pairs.A).all() and np.isfinite(pairs.C).all()):
         raise OpenArmError(Code.INVALID_ARGUMENT, "a pose has numbers that are not finite; remove that sample")
-    if len(pairs.A) < FEWEST or motion_fault(motion(pairs.A)):
-        fault = motion_fault(motion(pairs.A)) if len(pairs.A) else "too few poses: none"
+    if len(pairs.A) < FEWEST:
+        raise OpenArmError(Code.DEGENERATE, motion_fault(motion(pairs.A)) if len(pairs.A) else "too few poses: none")
+    seen = motion(pairs.A)
+    if (fault := motion_fault(seen)) and not seen.one_axis:
         raise OpenArmError(Code.DEGENERATE, fault)
-    used = np.ones(len(pairs.A), dtype=bool)
-    fit = _fit(pairs, used)
-    while used.sum() > max(_FEWEST_TO_REJECT, (1.0 - _MOST_REJECTED) * len(used)):
-        worst, distance = -1, 0.0
-        for k in np.flatnonzero(used):  # each against the answer and the noise of the others
-            rest = used.copy()
-            rest[k] = False
-            other = _fit(pairs, rest, fit)
-            away = float(np.sum((residuals(pairs.subset(~rest & used), other.X, other.Z) / _sigmas(other)) ** 2)) / 6.0
-            if away > distance:
-                worst, distance = int(k), away
-        freedom = 6 * (int(used.sum()) - 1) - 12
-        if distance <= stats.f.ppf(1.0 - _FALSE_ALARM / used.sum(), 6, freedom):
+    common = agreed(pairs.B, pairs.C)
+    held, free = _held(common, fixed or {})
+    noise = max(common.spread[0], _LEAST[0]), max(common.spread[1], _LEAST[1])
+    start = _Fit(common.X, common.Z, np.eye(12), noise)
+    far = np.maximum(common.translations / noise[0], common.rotations / noise[1]) > _FAR
+    used = ~far if _may_go(far) else np.ones(len(pairs.A), dtype=bool)
+    fit = _fit(pairs, used, start, held)
+    while _may_go(~used, 1):
+        one = max(np.flatnonzero(used), key=lambda k: _distance(pairs, used, int(k), fit, held))
+        if _distance(pairs, used, int(one), fit, held) <= _limit(used):
             break
-        used[worst] = False
-        fit = _fit(pairs, used, fit)
-    if fault := motion_fault(motion(pairs.A[used])):
+        used[one] = False
+        fit = _fit(pairs, used, fit, held)
+    for k in np.flatnonzero(~used):  # what was left out for the sake of another comes back
+        if _distance(pairs, used, int(k), fit, held) <= _limit(used):
+            used[k] = True
+            fit = _fit(pairs, used, fit, held)
+    # about one axis, and without a motion across it, the rotation about that axis is not told either
+    unsure = math.sqrt(np.trace(fit.covariance[3:6, 3:6])) > _UNSURE
+    if (fault := motion_fault(motion(pairs.A[used]))) and (unsure or not seen.one_axis):
         raise OpenArmError(Code.DEGENERATE, fault)
     distances = np.mean((residuals(pairs, fit.X, fit.Z) / _sigmas(fit)) ** 2, axis=1)
     inside = pairs.subset(used)
-    left_out = _left_out(inside, fit)
+    left_out = _left_out(inside, fit, held)
     method = _best(left_out, fit)
     X, Z, covariance = fit.X, fit.Z, fit.covariance
     if method != REFINED:
@@ -156,29 +185,72 @@ def solve_pairs(pairs: PosePairs) -> PairSolution:
         offset, angle = mount_error(X, fit.X)  # its own error is not known; the distance is the better part of it
         covariance = covariance.copy()
         covariance[:6, :6] += np.diag([offset**2 / 3.0] * 3 + [angle**2 / 3.0] * 3)
-    return PairSolution(X, Z, covariance, fit.noise, used, left_out, method, distances)
+    return PairSolution(X, Z, covariance, fit.noise, used, left_out, method, distances, free)
+
+
+def _held(common: Consensus, fixed: Mapping[str, float]) -> tuple[_Held | None, Array]:
+    """Return which position of the camera is held, and the direction that stays free."""
+    if not common.free.any():
+        if fixed:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"--fix {next(iter(fixed))}: the poses turn about two axes and tell all six numbers",
+            )
+        return None, common.free
+    if not fixed:
+        return _Held(common.free, float(common.free @ common.X[:3, 3])), common.free
+    axis, at = next(iter(fixed.items()))
+    along = np.eye(3)["xyz".index(axis)]
+    if abs(float(along @ common.free)) < _ALONG or len(fixed) > 1:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"--fix {' '.join(fixed)}: what the poses do not tell is the camera's place along its parent's"
+            f" {axis_name(common.free)}; give that one, m",
+        )
+    return _Held(along, at), np.zeros(3)
+
+
+def _may_go(out: Mask, more: int = 0) -> bool:
+    """Return whether so many pairs may be left out."""
+    count = int(np.count_nonzero(out)) + more
+    return len(out) - count >= max(_FEWEST_TO_REJECT - 1, math.ceil((1.0 - _MOST_REJECTED) * len(out)))
+
+
+def _distance(pairs: PosePairs, used: Mask, k: int, fit: _Fit, held: _Held | None) -> float:
+    """Return the squared distance of a pair from the answer of the others, over what is expected of them."""
+    rest = used.copy()
+    rest[k] = False
+    other = _fit(pairs, rest, fit, held)
+    alone = np.zeros(len(used), dtype=bool)
+    alone[k] = True
+    return float(np.sum((residuals(pairs.subset(alone), other.X, other.Z) / _sigmas(other)) ** 2)) / 6.0
+
+
+def _limit(used: Mask) -> float:
+    count = int(np.count_nonzero(used))
+    return float(stats.f.ppf(1.0 - _FALSE_ALARM / count, 6, max(6 * (count - 1) - 12, 1)))
 
 
 def _sigmas(fit: _Fit) -> Array:
     return np.array([fit.noise[0]] * 3 + [fit.noise[1]] * 3)
 
 
-def _fit(pairs: PosePairs, used: Mask, start: _Fit | None = None) -> _Fit:
+def _fit(pairs: PosePairs, used: Mask, start: _Fit, held: _Held | None) -> _Fit:
     """Return the mounts of least squares and the deviations that fit them."""
     part = pairs.subset(used)
-    if start is None:
-        mounts = closed_form("PARK", part.setup, part.A, part.C)
-        X, Z, noise = mounts.X, mounts.Z, (1e-3, 1e-3)
-    else:
-        X, Z, noise = start.X, start.Z, start.noise
+    X, Z, noise = start.X, start.Z, start.noise
+    row = np.zeros(12)
+    if held is not None:
+        row[:3] = held.along / _GIVEN
     information = np.eye(12)
     for _ in range(_ROUNDS):
         error = residuals(part, X, Z)
         J = _derivative(part, X, Z)
         weight = np.array([noise[0] ** -2.0] * 3 + [noise[1] ** -2.0] * 3)
-        information = np.einsum("nia,i,nib->ab", J, weight, J)
+        information = np.einsum("nia,i,nib->ab", J, weight, J) + np.outer(row, row)
         covariance = invert_scaled(information)
-        step = -covariance @ np.einsum("nia,i,ni->a", J, weight, error)
+        beyond = 0.0 if held is None else (float(held.along @ X[:3, 3]) - held.at) / _GIVEN
+        step = -covariance @ (np.einsum("nia,i,ni->a", J, weight, error) + row * beyond)
         X, Z = moved(X, step[:6]), moved(Z, step[6:])
         error = residuals(part, X, Z)
         spent = np.einsum("nia,ab,nib->i", J, covariance, J) * weight
@@ -205,20 +277,23 @@ def _derivative(pairs: PosePairs, X: Array, Z: Array) -> Array:
     return out
 
 
-def _left_out(pairs: PosePairs, fit: _Fit) -> dict[str, LeftOut | str]:
-    """Return how each method predicts each pair from the others."""
+def _left_out(pairs: PosePairs, fit: _Fit, held: _Held | None) -> dict[str, LeftOut | str]:
+    """Return how each method predicts each pair from the others; with one axis there are no closed forms."""
     every = ~np.eye(len(pairs.A), dtype=bool)
-    kept = [keep for keep in every if keep.sum() >= FEWEST and not motion_fault(motion(pairs.A[keep]))]
-    return {method: _predicted(pairs, method, fit, kept) for method in (REFINED, *METHODS)}
+    methods = (REFINED,) if held else (REFINED, *METHODS)
+    kept = [keep for keep in every if keep.sum() >= FEWEST and (held or not motion_fault(motion(pairs.A[keep])))]
+    return {method: _predicted(pairs, method, fit, kept, held) for method in methods}
 
 
-def _predicted(pairs: PosePairs, method: str, fit: _Fit, kept: list[Mask]) -> LeftOut | str:
+def _predicted(pairs: PosePairs, method: str, fit: _Fit, kept: list[Mask], held: _Held | None) -> LeftOut | str:
     """Return how a method predicts the pair that each of some masks (n,) leaves out."""
     errors: list[Array] = []
     for keep in kept:
         part = pairs.subset(keep)
         try:
-            solved = _fit(pairs, keep, fit) if method == REFINED else closed_form(method, part.setup, part.A, part.C)
+            solved = (
+                _fit(pairs, keep, fit, held) if method == REFINED else closed_form(method, part.setup, part.A, part.C)
+            )
             errors.append(residuals(pairs.subset(~keep), solved.X, solved.Z)[0])
         except (OpenArmError, ValueError) as error:  # a closed form may return a reflection
             return error.message if isinstance(error, OpenArmError) else "no rotation for some of the pairs"

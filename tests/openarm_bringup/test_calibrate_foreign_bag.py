@@ -146,7 +146,7 @@ TIP = ("--camera-kind", "eye_in_hand", "--tip", "ur_tool")
         ((*TIP, "--joint-topic", "tf"), "poses by /tf need --base and --tip"),
         ((*TIP, "--joint-topic", "tf", "--base", "ur_base"), "/tf does not lead from 'ur_tool' to 'ur_base'"),
         ((*TIP, "--urdf", "nowhere.urdf"), "nowhere.urdf does not exist"),
-        ((*TIP, "--unit", "mm"), "--unit is no option of the format bag"),
+        ((*TIP, "--unit", "mm"), "--unit is no option for a bag"),
         ((*TIP, "--intrinsics", "1,2"), "WIDTH,HEIGHT,FX,FY,CX,CY"),
     ],
 )

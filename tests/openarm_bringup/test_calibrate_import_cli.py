@@ -83,7 +83,7 @@ def info(path: Path, coefficients: np.ndarray | None = None) -> str:
     ("setup", "rotation", "unit", "frames", "lens"),
     [
         ("in_hand", "wxyz", "mm", "T_base_tip", None),
-        ("to_hand", "rpy_deg", "m", "T_tip_base", PLUMB_BOB),
+        ("to_hand", "xyz_deg", "m", "T_tip_base", PLUMB_BOB),
         ("in_hand", "rotvec", "m", "T_base_tip", RATIONAL),
     ],
 )
@@ -98,14 +98,14 @@ def test_a_csv_and_a_folder_of_images_are_solved_with_the_convention_found(
     path = files.table(tmp_path / "poses.csv", rows, names if lens is None else None, "image, x, y, z, a, b, c")
     session = tmp_path / "cam.npz"
     argv = (
-        "--camera-kind", f"eye_{setup}", "--images", str(tmp_path / "images"), "--board", BOARD,
+        "--camera-kind", f"eye_{setup}", "--frames", frames, "--images", str(tmp_path / "images"), "--board", BOARD,
         "--intrinsics", info(tmp_path / "cam.yaml", lens), "--session", str(session),
     )  # fmt: skip
     code, data = answer_of(capsys, "calibrate", "import", str(path), *argv)
     assert code == 0, data["message"]
     assert off(data, known)[0] < 2e-4
-    assert data["conventions"][0]["convention"].startswith(f"{frames}, ")
-    assert data["conventions"][0]["convention"].endswith(f", {unit}")
+    assert data["conventions"][0]["robot"].startswith(f"{frames}, ")
+    assert data["conventions"][0]["robot"].endswith(f", {unit}")
     assert all(row["sample"] for row in data["images"])
     samples, _ = load_session(session, RobotDescription.load())
     assert samples.pose(samples.samples[3].joints) == pytest.approx(known.A[3], abs=1e-6)
@@ -127,13 +127,20 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "binary.csv").write_bytes(b"\x00\xff\xfe" * 100)
     (folder / "words.samples").write_text("samples: hello")
     (folder / "one.samples").write_text("samples:\n- robot: {translation: {x: 0, y: 0, z: 0}}\n")
-    (folder / "bent.yaml").write_text(f"- effector_wrt_world: {[2.0] * 16}\n  object_wrt_sensor: {[0.0] * 16}\n")
+    files.moveit_json(folder / "pairs.json", known)
+    bent = [
+        {"effector_wrt_world": A.tolist(), "object_wrt_sensor": C.tolist()}
+        for A, C in zip(known.A, known.C, strict=True)
+    ]
+    bent[1]["effector_wrt_world"] = np.full((4, 4), 2.0).tolist()
+    (folder / "bent.yaml").write_text(json.dumps(bent))
     (folder / "deep.json").write_text("[" * 5000)
     (folder / "alias.yaml").write_text("a: &a [1]\nb: *a\n")
-    (folder / "nan.samples").write_text(
-        "samples:\n- robot: {translation: {x: .nan, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0, w: 1}}\n  tracking: {}\n"
-    )
-    (folder / "many.json").write_text(json.dumps([[0, 0]] * 3000))
+    lines = files.easy_handeye2(folder / "nan.samples", known).read_text().splitlines()
+    second = [k for k, line in enumerate(lines) if line.startswith("- robot")][1]
+    lines[second + 2] = "      x: .nan"
+    (folder / "nan.samples").write_text("\n".join(lines))
+    (folder / "many.json").write_text(json.dumps([[np.eye(4).tolist()] * 2] * 2001))
     (folder / "tool.txt").write_text("hello\n")
     (folder / "mapping.yaml").write_text("a: 1\n")
     (folder / "info.yaml").write_text("image_width: 640\n")
@@ -152,9 +159,9 @@ HAND = ("--camera-kind", "eye_in_hand")
     ("argv", "code", "words"),
     [
         (("nowhere.csv",), 2, "there is no nowhere.csv"),
-        (("poses.csv",), 2, "give --camera-kind eye_in_hand or eye_to_hand"),
-        (("poses.csv", *HAND), 2, "needs --images"),
-        (("poses.csv", *HAND, "--images", "images"), 2, "needs --board"),
+        (("poses.csv",), 2, "has poses of the robot alone ('poses', 6); give --images FOLDER"),
+        (("poses.csv", *IMAGES), 2, "give --camera-kind eye_in_hand or eye_to_hand"),
+        (("poses.csv", *HAND, "--images", "images"), 2, "need --board"),
         (
             ("poses.csv", *HAND, *IMAGES[:2], *IMAGES[4:], "--board", "charuco:7x5:9"),
             2,
@@ -171,25 +178,26 @@ HAND = ("--camera-kind", "eye_in_hand")
         (("poses.csv", *HAND, *IMAGES[2:], "--images", "few"), 2, "has 0 images for 6 poses"),
         (("poses.csv", *HAND, *IMAGES[2:], "--images", "broken"), 1, "is no image that can be read"),
         (("poses.csv", *HAND, *IMAGES[:2], *IMAGES[4:], "--board", "charuco"), 1, "in 0 of 6 images"),
-        (("poses.csv", *HAND, *IMAGES, "--rotation", "matrix"), 1, "matrix with 7 numbers a pose"),
-        (("poses.csv", *HAND, *IMAGES, "--image-topic", "/a"), 2, "--image-topic is no option of the format csv"),
+        (("poses.csv", *HAND, *IMAGES, "--rotation", "matrix"), 1, "give --rotation xyzw"),
+        (("poses.csv", *HAND, *IMAGES, "--image-topic", "/a"), 2, "--image-topic is no option for poses and images"),
         (("short.csv", *HAND, *IMAGES), 1, "5 numbers a pose"),
         (("named.csv", *HAND, *IMAGES), 2, "has no image 'img0.png'"),
-        (("ragged.csv", *HAND, *IMAGES), 1, "pose 2 has 3 numbers"),
+        (("ragged.csv", *HAND, *IMAGES), 1, "ragged.csv:2 has 3 cells, expected 7"),
         (("empty.csv", *HAND, *IMAGES), 1, "has no poses"),
         (("binary.csv", *HAND, *IMAGES), 1, "is no text in UTF-8"),
         (("tool.txt", *HAND, *IMAGES), 1, "has no poses"),
-        (("words.samples", *HAND), 1, "expected a mapping with a list `samples`"),
-        (("one.samples", *HAND), 1, "sample 1: robot is no transform"),
-        (("nan.samples", *HAND), 1, "sample 1: robot: a quaternion of length 1, or a place that is none"),
-        (("bent.yaml", *HAND), 1, "sample 1: effector_wrt_world is no pose"),
-        (("bent.yaml",), 2, "give --camera-kind"),
-        (("bent.yaml", *HAND, "--session", "a.npz"), 2, "--session is no option of the format moveit"),
+        (("words.samples", *HAND), 1, "has no poses that are repeated"),
+        (("one.samples", *HAND), 1, "has no poses that are repeated"),
+        (("nan.samples", *HAND), 1, "record 2 has no samples.robot"),
+        (("bent.yaml", *HAND), 1, "record 2 is no rotation as matrix by rows"),
+        (("pairs.json",), 2, "give --camera-kind"),
+        (("pairs.json", *HAND, "--session", "a.npz"), 2, "--session is no option for pairs of poses"),
+        (("pairs.json", *HAND, "--fix", "up"), 2, "expected an axis and metres, such as z=0.12"),
         (("deep.json", *HAND), 1, "is not valid JSON"),
         (("alias.yaml", *HAND), 1, "aliases are not accepted"),
-        (("many.json", *HAND), 1, "3000 samples, expected at most 2000"),
-        (("mapping.yaml", *HAND), 1, "no .csv and no bag"),
-        (("few", *HAND), 2, "is not a bag"),
+        (("many.json", *HAND), 1, "has 2001 poses, expected at most 2000"),
+        (("mapping.yaml", *HAND), 1, "has no poses that are repeated"),
+        (("few", *HAND), 1, "has no file of poses; read are .yaml"),
     ],
 )
 @pytest.mark.requirement("A-45")

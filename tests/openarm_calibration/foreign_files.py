@@ -96,19 +96,19 @@ def moveit_json(path: Path, known: Truth) -> Path:
 
 
 def numbers(A: Array, rotation: str, unit: str = "m", frames: str = "T_base_tip") -> Array:
-    """Return the rows (n, k) of poses as a table has them."""
-    T = A if frames == "T_base_tip" else np.linalg.inv(A)
+    """Return the rows (n, k) of poses as a table has them, by scipy's conversions."""
+    T = A if frames in ("T_base_tip", "T_camera_board") else np.linalg.inv(A)
     R, p = Rotation.from_matrix(T[:, :3, :3]), T[:, :3, 3] * (1000.0 if unit == "mm" else 1.0)
-    if rotation == "matrix":
+    if rotation in ("matrix", "columns"):
         M = T.copy()
         M[:, :3, 3] = p
-        return M.reshape(-1, 16)
-    parts = {
-        "xyzw": R.as_quat, "wxyz": lambda: R.as_quat(scalar_first=True), "rotvec": R.as_rotvec,
-        "rotvec_deg": lambda: R.as_rotvec(degrees=True), "rpy": lambda: R.as_euler("xyz"),
-        "rpy_deg": lambda: R.as_euler("xyz", degrees=True), "abc_deg": lambda: R.as_euler("ZYX", degrees=True),
-    }  # fmt: skip
-    return np.hstack([p, parts[rotation]()])
+        return (M if rotation == "matrix" else M.swapaxes(1, 2)).reshape(-1, 16)
+    name, degrees = rotation.removesuffix("_deg"), rotation.endswith("_deg")
+    if name == "rotvec":
+        return np.hstack([p, R.as_rotvec(degrees=degrees)])
+    if name in ("xyzw", "wxyz"):
+        return np.hstack([p, R.as_quat(scalar_first=name == "wxyz")])
+    return np.hstack([p, R.as_euler(name, degrees=degrees)])
 
 
 def table(path: Path, rows: Array, names: list[str] | None = None, header: str = "") -> Path:

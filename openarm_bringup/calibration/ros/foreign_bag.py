@@ -19,8 +19,8 @@ from openarm_calibration.board.detect import detect
 from openarm_calibration.board.detection import BoardDetection
 from openarm_calibration.foreign.image_sets import grey_of
 from openarm_calibration.foreign.optics import Lens, lens_of
-from openarm_calibration.foreign.pose_files import kind_of
 from openarm_calibration.foreign.pose_robot import joints_of_pose, robot_of_poses
+from openarm_calibration.foreign.pose_source import kind_of
 from openarm_calibration.ros.image_capture import grey
 from openarm_calibration.sampling.gate import GateConfig
 from openarm_calibration.sampling.samples import SampleSet, SessionHead

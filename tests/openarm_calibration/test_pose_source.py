@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of poses as other programs write them: OpenCV's FileStorage, NumPy's arrays, tables, a file for each pose."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from openarm_calibration.foreign.conventions import checked_form, read
+from openarm_calibration.foreign.pose_source import Column, read_source
+from openarm_common.errors import Code
+from tests.openarm_calibration import foreign_files as files
+from tests.refusals import refuses
+
+pytestmark = pytest.mark.requirement("P-28", "A-36")
+KNOWN = files.truth("to_hand", 8)
+A, C = KNOWN.A, KNOWN.C
+
+
+def poses(column: Column | None, form: str = "matrix") -> np.ndarray:
+    """The poses of a column, in the form that it tells, or else in this one."""
+    assert column is not None
+    found = read(checked_form(column.rotation or form), column.rows)
+    assert found is not None
+    return found
+
+
+def storage(path: Path) -> Path:
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    file.write("calibration_time", "Sun")
+    file.write("camera_matrix", files.K.matrix)
+    for k, (a, c) in enumerate(zip(A, C, strict=True)):
+        file.write(f"T_gripper2base_{k}", a)
+        file.write(f"T_target2cam_{k}", c)
+    file.release()
+    return path
+
+
+def storage_of_parts(path: Path) -> Path:
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for k, (a, c) in enumerate(zip(A, C, strict=True)):
+        file.write(f"R_gripper2base_{k}", a[:3, :3])
+        file.write(f"t_gripper2base_{k}", a[:3, 3:])
+        file.write(f"rvec_target2cam_{k}", cv2.Rodrigues(c[:3, :3])[0])
+        file.write(f"tvec_target2cam_{k}", c[:3, 3:])
+    file.release()
+    return path
+
+
+def arrays_of_parts(path: Path) -> Path:
+    np.savez(path, R_gripper2base=A[:, :3, :3], t_gripper2base=A[:, :3, 3:], R_target2cam=C[:, :3, :3],
+             t_target2cam=C[:, :3, 3], camera_matrix=files.K.matrix)  # fmt: skip
+    return path
+
+
+def arrays(path: Path) -> Path:
+    np.savez(path, robot=A, board=C)
+    return path
+
+
+def a_file_each(path: Path) -> Path:
+    path.mkdir()
+    for k, (a, c) in enumerate(zip(A, C, strict=True)):
+        turn = Rotation.from_matrix(a[:3, :3]).as_quat().tolist()
+        robot = {
+            "position": dict(zip("xyz", a[:3, 3].tolist(), strict=True)),
+            "orientation": dict(zip("xyzw", turn, strict=True)),
+        }
+        board = {"rvec": cv2.Rodrigues(c[:3, :3])[0].tolist(), "tvec": c[:3, 3:].tolist()}
+        (path / f"{k}.json").write_text(json.dumps({"hand": robot, "eye": board, "stamp": k}))
+    return path
+
+
+def matrices_each(path: Path) -> Path:
+    for name, T in (("robot", A), ("camera", C)):
+        (path / name).mkdir(parents=True)
+        for k, one in enumerate(T):
+            np.savetxt(path / name / f"pose{k}.txt", one)
+    return path
+
+
+def lines_of_either(path: Path) -> Path:
+    lines = []
+    for a, c in zip(files.numbers(A, "rotvec"), files.numbers(C, "rotvec"), strict=True):
+        lines += [f"{who},{','.join(map(repr, row.tolist()))}\n" for who, row in (("hand", a), ("eye", c))]
+    path.write_text("".join(lines))
+    return path
+
+
+def one_line_each(path: Path) -> Path:
+    np.savetxt(path, np.hstack([files.numbers(A, "matrix"), files.numbers(C, "matrix")]), delimiter=",")
+    return path
+
+
+def named_columns(path: Path) -> Path:
+    names = [f"{who}_{part}" for who in ("tcp", "marker") for part in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
+    rows = np.hstack([np.arange(8)[:, None], files.numbers(A, "xyzw"), files.numbers(C, "xyzw")])
+    np.savetxt(path, rows, delimiter=";", header=";".join(["id", *names]), comments="")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("write", "name", "forms"),
+    [
+        (storage, "a.yml", ("matrix", "matrix")), (storage, "a.xml", ("matrix", "matrix")),
+        (storage, "a.json", ("matrix", "matrix")), (storage_of_parts, "b.yml", ("matrix", "rotvec")),
+        (arrays_of_parts, "c.npz", ("matrix", "matrix")), (arrays, "d.npz", ("matrix", "matrix")),
+        (a_file_each, "folder", ("xyzw", "rotvec")), (matrices_each, "folders", ("matrix", "matrix")),
+        (lines_of_either, "e.csv", ("rotvec", "rotvec")), (one_line_each, "f.csv", ("matrix", "matrix")),
+        (named_columns, "g.csv", ("xyzw", "xyzw")),
+        (lambda path: files.easy_handeye2(path, KNOWN), "h.samples", ("xyzw", "xyzw")),
+        (lambda path: files.moveit_yaml(path, KNOWN), "i.yaml", ("matrix", "matrix")),
+        (lambda path: files.moveit_json(path, KNOWN), "j.json", ("matrix", "matrix")),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_pairs_of_poses_are_found_in_what_programs_write(
+    tmp_path: Path, write: Callable[[Path], Path], name: str, forms: tuple[str, str]
+) -> None:
+    source = read_source(write(tmp_path / name))
+    expected = np.linalg.inv(A) if name.endswith(".samples") else A  # as easy_handeye2 does for a fixed camera
+    assert poses(source.robot, forms[0]) == pytest.approx(expected, abs=1e-8)
+    assert poses(source.board, forms[1]) == pytest.approx(C, abs=1e-8)
+    assert len(source.robot.labels) == len(A)
+
+
+def test_two_files_of_tum_and_two_arrays_are_pairs(tmp_path: Path) -> None:
+    times = 1.7e9 + np.arange(8)[:, None]
+    for name, T in (("one", A), ("two", C)):
+        rows = np.hstack([times, files.numbers(T, "xyzw")])
+        np.savetxt(tmp_path / f"{name}.txt", rows, header="timestamp tx ty tz qx qy qz qw")
+        np.save(tmp_path / f"{name}.npy", T)
+    for ending, form in (("txt", "xyzw"), ("npy", "matrix")):
+        source = read_source(tmp_path / f"one.{ending}", tmp_path / f"two.{ending}")
+        assert poses(source.robot, form) == pytest.approx(A, abs=1e-8)
+        assert poses(source.board, form) == pytest.approx(C, abs=1e-8)
+
+
+def test_columns_are_named_by_the_command_line_and_units_by_a_header(tmp_path: Path) -> None:
+    rows = files.numbers(A, "wxyz")[:, [3, 4, 5, 6, 0, 1, 2]]
+    np.savetxt(tmp_path / "a.txt", np.hstack([rows, np.zeros((8, 1))]))
+    source = read_source(tmp_path / "a.txt", columns="qw qx qy qz x y z -")
+    assert poses(source.robot) == pytest.approx(A, abs=1e-8)
+    degrees = files.numbers(A, "xyz_deg", "mm")
+    head = "image,X [mm],Y [mm],Z [mm],roll (deg),pitch (deg),yaw (deg)"
+    text = "\n".join(f"{k}.png," + ",".join(map(repr, row)) for k, row in enumerate(degrees.tolist()))
+    (tmp_path / "b.csv").write_text(f"{head}\n{text}\n")
+    source = read_source(tmp_path / "b.csv")
+    assert (source.robot.rotation, source.robot.unit) == ("rpy_deg", "mm")
+    assert source.images == tuple(f"{k}.png" for k in range(8))
+
+
+def test_corners_without_pictures_come_with_the_poses(tmp_path: Path) -> None:
+    corners = np.random.default_rng(0).uniform(0.0, 640.0, (8, 12, 2))
+    records = [{"corners": pixels.tolist(), "T_base_hand": a.tolist()} for a, pixels in zip(A, corners, strict=True)]
+    (tmp_path / "views.json").write_text(json.dumps({"K": files.K.matrix.tolist(), "views": records}))
+    source = read_source(tmp_path / "views.json")
+    assert source.board is None
+    assert source.corners is not None
+    assert source.corners.rows == pytest.approx(corners)
+    assert poses(source.robot) == pytest.approx(A)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.json", '{"a": 1}', "no poses that are repeated: read are 4x4"),
+        ("b.csv", "1,2,3,4,5\n" * 3, "has 5 numbers a pose; expected 6 .*--columns"),
+        ("c.csv", "1,2,3\n1,2\n", "c.csv:2 has 2 cells, expected 3"),
+        ("d.csv", "1,2,3,4,5,6\n1,2,x,4,5,6\n", "d.csv:2: 'x' is no finite number"),
+        ("e.xml", "<!DOCTYPE a><a/>", "has a document type"),
+        ("f.npz", "PK", "holds no arrays of numbers that can be read"),
+        ("g.npy", "\x93NUMPY", "holds no arrays"),
+        ("h.json", json.dumps([[np.eye(4).tolist()] * 3] * 4), "has the poses .* give two files: FILE --with FILE"),
+    ],
+)
+@pytest.mark.requirement("A-45")
+def test_what_can_not_be_read_is_refused_with_what_is_and_what_to_type(tmp_path, name, text, words) -> None:
+    (tmp_path / name).write_text(text)
+    with refuses(Code.CONFIG_INVALID, words):
+        read_source(tmp_path / name)
