@@ -38,6 +38,7 @@ def imported(path: Path, given: Foreign) -> Outcome:
     Raises:
         OpenArmError: What is wrong with file or options; DEGENERATE, when the poses determine nothing.
     """
+    from openarm_calibration.foreign.explain import Unexplained, table
     from openarm_calibration.foreign.pose_source import read_source
 
     if not path.exists():
@@ -46,17 +47,19 @@ def imported(path: Path, given: Foreign) -> Outcome:
         _refuse(given, "a bag")
         return _of_bag(path, given)
     source = read_source(path, given.with_, given.columns)
-    if source.board is not None and given.images is None:
-        _refuse(given, "pairs of poses")
-        return _of_pairs(path, source, given)
-    if source.corners is None and given.images is None:
+    pairs = source.board is not None and given.images is None
+    if not pairs and source.corners is None and given.images is None:
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             f"{path} has poses of the robot alone ({source.robot.name!r}, {len(source.robot.rows)}); give --images"
             " FOLDER with --board and --intrinsics, or --with FILE, which has the board's poses or corners",
         )
-    _refuse(given, "poses and images")
-    return _of_views(path, source, given)
+    _refuse(given, "pairs of poses" if pairs else "poses and images")
+    try:
+        return _of_pairs(path, source, given) if pairs else _of_views(path, source, given)
+    except Unexplained as error:
+        data = {"conventions": [one.as_json() for one in error.tried]}
+        return Outcome(False, error.message, error.code, data, table(error.tried))
 
 
 def _refuse(given: Foreign, what: str) -> None:

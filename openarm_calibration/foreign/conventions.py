@@ -33,6 +33,8 @@ Unit = Literal["m", "cm", "mm", "inch"]
 UNITS: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 #: A quaternion may be off one by this, a matrix off a rotation.
 _LOOSE = 0.02
+#: No pose has a larger number: ten kilometres in mm.
+_WILD = 1e7
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,10 @@ def readings(rows: Array, frames: str, names: Sequence[str] = ()) -> tuple[Conve
         raise OpenArmError(
             Code.CONFIG_INVALID, f"{rows.shape[1]} numbers a pose; expected one of these counts, {by_count}"
         )
+    if (wild := np.abs(rows).max(axis=1) > _WILD).any():
+        k = int(np.argmax(wild))
+        where = names[k] if len(names) == len(rows) else f"pose {k + 1}"
+        raise OpenArmError(Code.CONFIG_INVALID, f"{where} has the number {np.abs(rows[k]).max():g}, which no pose has")
     out: list[Convention] = []
     seen: list[Array] = []
     for form in every:

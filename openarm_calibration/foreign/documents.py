@@ -10,6 +10,7 @@ import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,7 @@ def _arrays(path: Path) -> dict[str, Any]:
         else:
             read = {path.stem: _array(data.getvalue())}
     except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, RuntimeError, OverflowError,
-            NotImplementedError, SyntaxError, MemoryError) as error:  # fmt: skip
+            NotImplementedError, SyntaxError, MemoryError, TokenError) as error:  # fmt: skip
         raise OpenArmError(
             Code.CONFIG_INVALID, f"{path} holds no arrays of numbers that can be read: {type(error).__name__}"
         ) from error

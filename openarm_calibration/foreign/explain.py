@@ -124,6 +124,19 @@ class Tried:
         }  # fmt: skip
 
 
+class Unexplained(OpenArmError):
+    """No convention that is stated explains the poses.
+
+    Args:
+        message: Why, and what to do.
+        tried: All conventions that were tried.
+    """
+
+    def __init__(self, message: str, tried: tuple[Tried, ...]) -> None:
+        super().__init__(Code.DEGENERATE, message)
+        self.tried = tried
+
+
 def search(robot: Poses, board: Poses, setups: Sequence[Setup]) -> tuple[Tried, ...]:
     """Try conventions; the best first. Those that contradict what is stated are among them.
 
@@ -169,29 +182,28 @@ def decided(tried: tuple[Tried, ...], setups: Sequence[Setup], robot: Poses, boa
         board: As of `search`.
 
     Raises:
-        OpenArmError: DEGENERATE, when none explains the poses, another one than the stated does, or several do.
+        Unexplained: When none explains the poses, another one than the stated does, or several do.
     """
     best = tried[0]
     given = next((one for one in tried if one.given), None)
     if not best.fits:
-        raise OpenArmError(
-            Code.DEGENERATE,
+        raise Unexplained(
             f"no convention explains the poses: the best, {best.text}, leaves {best.left}"
             f"{_standing_out(best, robot.names)}; do the poses of robot and board belong together, line by line, and"
-            f" did the board stand still on its carrier?\n{table(tried)}",
+            " did the board stand still on its carrier?",
+            tried,
         )
     if given is None or not given.fits or given.score > _CONTRADICTED * best.score:
         stated = f"as stated ({given.text}) {given.left} remain; " if given else ""
-        told = _to_type(best, setups, robot, board)
-        raise OpenArmError(Code.DEGENERATE, f"{stated}as {best.text} {best.left}: {told}\n{table(tried)}")
+        raise Unexplained(f"{stated}as {best.text} {best.left}: {_to_type(best, setups, robot, board)}", tried)
     form = given.robot.rotation, given.board.rotation
     for rival in tried:
         other = rival.robot.rotation, rival.board.rotation
         if rival.given and other != form and rival.score < _AMBIGUOUS * given.score:
-            raise OpenArmError(
-                Code.DEGENERATE,
+            raise Unexplained(
                 f"{given.text} and {rival.text} explain the poses about as well; give --rotation or --board-rotation,"
-                f" or more poses with larger rotations\n{table(tried)}",
+                " or more poses with larger rotations",
+                tried,
             )
     return given
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from openarm_calibration.handeye.closed_form import nearest_rotation
 from openarm_common import se3
 from openarm_common.types import Array
 
@@ -74,7 +75,7 @@ def agreed(B: Array, C: Array, *, scaled: bool = False, rounds: int = ROUNDS) ->
 
     def turned(angle: float, rounds: int = 1) -> Consensus:
         RX = start @ se3.exp_so3(axis * angle)
-        RZ = _nearest(np.einsum("nji,jk,nkl->il", RB, RX, RC))
+        RZ = nearest_rotation(np.einsum("nji,jk,nkl->il", RB, RX, RC))
         return _agreed(B, C, RX, RZ, scaled, RX @ axis, rounds)
 
     def left(angle: float) -> float:
@@ -98,12 +99,6 @@ def _agreed(
     return Consensus(se3.make(RX, tX), se3.make(RZ, tZ), scale, away, angles, free)
 
 
-def _nearest(M: Array) -> Array:
-    """Return the rotation (3, 3) nearest to a matrix."""
-    U, _, Vt = np.linalg.svd(M)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-
-
 def _rotations(RB: Array, RC: Array, rounds: int) -> tuple[Array, Array]:
     """Return R_X and R_Z of least absolute angles: a closed form, and then Gauss-Newton steps."""
     weight = np.ones(len(RB))
@@ -112,8 +107,8 @@ def _rotations(RB: Array, RC: Array, rounds: int) -> tuple[Array, Array]:
         if k < _CLOSED:
             M = np.einsum("n,nij,nkl->ikjl", weight, RB, RC).reshape(9, 9)
             RZ = np.linalg.svd(M)[2][0].reshape(3, 3)
-            RZ = _nearest(RZ if np.linalg.det(RZ) > 0.0 else -RZ)
-            RX = _nearest(np.einsum("n,nij,jk,nlk->il", weight, RB, RZ, RC))
+            RZ = nearest_rotation(RZ if np.linalg.det(RZ) > 0.0 else -RZ)
+            RX = nearest_rotation(np.einsum("n,nij,jk,nlk->il", weight, RB, RZ, RC))
         predicted = np.einsum("ji,njk,kl->nil", RX, RB, RZ)
         off = Rotation.from_matrix(np.swapaxes(RC, 1, 2) @ predicted).as_rotvec()
         angles = np.linalg.norm(off, axis=1)

@@ -12,13 +12,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from openarm_calibration.handeye.problem import Problem
 from openarm_calibration.handeye.unknowns import Estimate, Noise
-from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 
+#: Most poses between which the motion is looked at.
+_MOST = 100
 #: Fewer can't determine twelve unknowns.
 FEWEST = 3
 #: Rotations below this can't be distinguished from the robot's own errors, rad.
@@ -66,10 +68,11 @@ class Motion:
 def motion(A: Array) -> Motion:
     """Describe the motion of robot poses A (n, 4, 4)."""
     n = len(A)
-    logs = [se3.log_so3(A[i, :3, :3].T @ A[j, :3, :3]) for i in range(n) for j in range(i + 1, n)]
-    if not logs:
+    if n < 2:
         return Motion(n, 0.0, 0.0, 0.0, np.array([0.0, 0.0, 1.0]), "x")
-    w = np.array(logs)
+    A = A[np.unique(np.linspace(0, n - 1, min(n, _MOST)).astype(int))]
+    first, second = np.triu_indices(len(A), 1)
+    w = Rotation.from_matrix(np.swapaxes(A[first, :3, :3], 1, 2) @ A[second, :3, :3]).as_rotvec()
     axis = np.linalg.eigh(w.T @ w)[1][:, -1]
     across = np.linalg.norm(w - np.outer(w @ axis, axis), axis=1)
     apart = np.linalg.norm(A[:, None, :3, 3] - A[None, :, :3, 3], axis=-1)
