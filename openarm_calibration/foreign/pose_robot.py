@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from scipy.spatial.transform import Rotation
 
@@ -39,6 +39,11 @@ def robot_of_poses(base: str, tip: str) -> RobotDescription:
         for (name, kind, axis), parent, child in zip(_JOINTS, names, names[1:], strict=False)
     )
     return RobotDescription.from_urdf(f'<robot name="poses">{links}{joints}</robot>')
+
+
+def are_of_pose(names: Sequence[str]) -> bool:
+    """Return whether joints are those that stand for a pose: nothing is known of the robot's own."""
+    return tuple(names) == tuple(name for name, _, _ in _JOINTS)
 
 
 def joints_of_pose(T: Array) -> Mapping[str, float]:

@@ -144,7 +144,7 @@ def require_accuracy(problem: Problem, estimate: Estimate, most_translation: flo
     condition = condition_number(problem, estimate.information)
     if condition > _WORST_CONDITION:
         raise _degenerate(
-            motion(problem.A[problem.kind < 2]), estimate.noise,
+            problem, motion(problem.A[problem.kind < 2]), estimate.noise,
             f"some direction of the mounts is not determined (condition {condition:.1e}, at most"
             f" {_WORST_CONDITION:.0e} is accepted)",
         )  # fmt: skip
@@ -154,7 +154,7 @@ def require_accuracy(problem: Problem, estimate: Estimate, most_translation: flo
         t, r = math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum())
         if t > most_translation or r > most_rotation:
             raise _degenerate(
-                motion(problem.A[(problem.camera == camera) & (problem.kind < 2)]), estimate.noise,
+                problem, motion(problem.A[(problem.camera == camera) & (problem.kind < 2)]), estimate.noise,
                 f"the predicted error is {t * 1e3:.2g} mm and {math.degrees(r):.2g}°,"
                 f" more than {most_translation * 1e3:g} mm or {math.degrees(most_rotation):g}°",
             )  # fmt: skip
@@ -171,7 +171,7 @@ def condition_number(problem: Problem, information: Array) -> float:
     return float(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
 
-def _degenerate(seen: Motion, noise: Noise, what: str) -> OpenArmError:
+def _degenerate(problem: Problem, seen: Motion, noise: Noise, what: str) -> OpenArmError:
     """Return the refusal of an answer: its cause, what is wrong with it, and what to do."""
     advice = "add poses, nearer to the board and with larger rotations"
     if seen.rotation < _SMALL_ROTATION:
@@ -189,10 +189,8 @@ def _degenerate(seen: Motion, noise: Noise, what: str) -> OpenArmError:
             f" {noise.translation * 1e3:.1f} mm and {math.degrees(noise.rotation):.2f}°"
             + (f", and their marks by {noise.view_px:.1f} px" if noise.misfit > _BAD_MISFIT else "")
         )
-        advice = (
-            "check the joint zeros (`openarm calibrate zeros`), the intrinsics in camera_info, the size of the board,"
-            " and that it did not move"
-        )
+        zeros = "the joint zeros (`openarm calibrate zeros`), " if problem.joints else ""
+        advice = f"check {zeros}the intrinsics in camera_info, the size of the board, and that it did not move"
     else:
         cause = f"{seen.poses} poses that are too noisy or too far from the board"
     return OpenArmError(Code.DEGENERATE, f"{cause}: {what}; {advice}")

@@ -27,6 +27,8 @@ from openarm_common.types import Array
 Grade = Literal["pass", "warn", "fail"]
 #: Ratio to a limit beyond which a calibration fails.
 _FAIL = 3.0
+#: Of a robot whose joints are not known.
+_OF_POSES = "poses that are not of one moment with the images, or of another link"
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
     }  # fmt: skip
     outliers, views = len(solution.outliers), len(problem)
     arm = solution.estimate.noise
+    by_zeros = "wrong joint zeros; find them by `openarm calibrate zeros`" if problem.joints else _OF_POSES
     checks = [
         Check("position", sigma_t / limits.translation, f"predicted error of the position {sigma_t * 1e3:.3f} mm"),
         Check("rotation", sigma_r / limits.rotation, f"predicted error of the rotation {math.degrees(sigma_r):.4f}°"),
@@ -136,7 +139,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         Check(
             "robot", arm.rotation / limits.robot,
             f"the hand seems off by {arm.translation * 1e3:.1f} mm and {math.degrees(arm.rotation):.2f}° from pose to"
-            " pose, as with wrong joint zeros; find them by `openarm calibrate zeros`",
+            f" pose, as with {by_zeros}",
         ),
         Check(
             "contradictions", outliers / max(views, 1) / 0.1,

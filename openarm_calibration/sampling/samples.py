@@ -29,6 +29,7 @@ from pydantic import Field, field_validator
 
 from openarm_calibration.board.board import Board, parse_board
 from openarm_calibration.board.detect import BoardDetection, guess_pose
+from openarm_calibration.foreign.pose_robot import are_of_pose
 from openarm_calibration.handeye.kinematics import Kinematics, Posture
 from openarm_calibration.handeye.problem import Problem, View, assemble
 from openarm_calibration.handeye.transforms import difference
@@ -244,7 +245,7 @@ class SampleSet:
         if not self._samples:
             raise OpenArmError(Code.DEGENERATE, "too few poses: no samples; take at least 3, better 10 to 15")
         views: list[View] = []
-        kinematics = self.kinematics(self.joint_names)
+        kinematics = None if are_of_pose(self.joint_names) else self.kinematics(self.joint_names)
         for k, sample in enumerate(self._samples):
             t_ns = sample.t_image_ns - round(delay_s * 1e9)
             early, late = (self.pose_at(sample, t_ns + step) for step in (-_RATE_STEP_NS, _RATE_STEP_NS))
@@ -252,7 +253,8 @@ class SampleSet:
             rate = difference(early, late) / (2e-9 * _RATE_STEP_NS)
             points = self.board.points[sample.detection.ids]
             view = View(points, sample.detection.pixels, A, self.head.setup, self.board.radius, pose=k, rate=rate)
-            views.append(replace(view, name=sample.name, arm=Posture(kinematics, sample.joints)))
+            arm = None if kinematics is None else Posture(kinematics, sample.joints)
+            views.append(replace(view, name=sample.name, arm=arm))
         return assemble(views, [self.head.optics], [sample.T_camera_board for sample in self._samples])
 
     # --- session file
