@@ -33,9 +33,10 @@ class Foreign:
         with_: Second file, of the board's poses or corners, where the first has those of the robot alone.
         columns: Names of a table's columns, such as "image x y z qx qy qz qw" (rx ry rz, roll pitch yaw, m00 to m33);
             robot_x, board_x, ... of pairs, - for one to leave out.
-        board: Of images and corners: the board, such as charuco:7x5:34mm:26mm:DICT_6X6_250, its keys, or a YAML file.
+        board: Board in images and corners, such as charuco:7x5:34mm:26mm:DICT_6X6_250, its keys, or a YAML file.
         images: Folder of images, one for each pose.
-        intrinsics: Of images and corners: camera_info YAML, or WIDTH,HEIGHT,FX,FY,CX,CY. A bag has its own.
+        intrinsics: Camera of images and corners: camera_info YAML, OpenCV's YAML, XML or JSON, or
+            WIDTH,HEIGHT,FX,FY,CX,CY. A bag has its own.
         rotation: Robot's rotations: xyzw, wxyz, matrix, columns, rotvec, rpy, abc, or axes such as XYZ (moving) or zyz
             (fixed), with _deg for degrees; found when not given.
         unit: Unit of the robot's positions; found when not given.
@@ -104,14 +105,15 @@ def lens_given(text: str) -> Lens:
     """
     from openarm_calibration.foreign.optics import lens_of, read_camera_info
 
-    if text.endswith((".yaml", ".yml")):
+    if text.endswith((".yaml", ".yml", ".json", ".xml")):
         return read_camera_info(Path(text).expanduser())
     try:
         width, height, fx, fy, cx, cy = (float(part) for part in text.split(","))
     except ValueError as error:
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
-            f"--intrinsics {text!r}: expected a camera_info YAML, or WIDTH,HEIGHT,FX,FY,CX,CY in pixels",
+            f"--intrinsics {text!r}: expected a camera_info YAML (or OpenCV's YAML, XML, JSON), or"
+            " WIDTH,HEIGHT,FX,FY,CX,CY in pixels",
         ) from error
     if not (width.is_integer() and height.is_integer()):
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--intrinsics {text}: width and height are no whole numbers")

@@ -17,8 +17,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from openarm_calibration.foreign.documents import read_document
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.config import load_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 from openarm_common.types import Array
@@ -101,7 +101,7 @@ def lens_of(
 
     Args:
         size: Width and height of the image.
-        k: Nine numbers of K, by rows.
+        k: Nine numbers of K, by rows; by columns where only that can be.
         model: Distortion model.
         coefficients: Of it.
         where: Begins the error.
@@ -109,6 +109,8 @@ def lens_of(
     Raises:
         OpenArmError: BAD_IMAGE, naming what is wrong.
     """
+    if k[2] == 0.0 == k[5] and k[6] != 0.0 != k[7]:
+        k = [k[j] for j in (0, 3, 6, 1, 4, 7, 2, 5, 8)]  # by columns
     optics = Intrinsics(int(size[0]), int(size[1]), float(k[0]), float(k[4]), float(k[2]), float(k[5]))
     if fault := optics.fault():
         raise OpenArmError(Code.BAD_IMAGE, f"{where} is not calibrated: {fault}")
@@ -127,27 +129,62 @@ def lens_of(
     return Lens(optics, model, values)
 
 
+#: Names that files have for the matrix, the distortion, and the size of the image.
+_MATRIX = ("camera_matrix", "cameramatrix", "k", "mtx", "intrinsic_matrix", "intrinsics", "matrix")
+_DISTORTION = ("distortion_coefficients", "distortion", "distcoeffs", "dist_coeffs", "dist", "d", "coefficients")
+_SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
+
+
 def read_camera_info(path: Path) -> Lens:
-    """Read a camera_info YAML of camera_calibration_parsers.
+    """Read intrinsics: a camera_info YAML, what OpenCV's FileStorage writes, or JSON with a matrix and a size.
 
     Raises:
         OpenArmError: CONFIG_INVALID, naming the file and what is wrong; BAD_IMAGE, as `lens_of`.
     """
-    data = load_yaml(path)
+    document: Any = read_document(path)
+    entries = {str(key).lower(): value for key, value in document.items()} if isinstance(document, dict) else {}  # pyright: ignore
+    entries |= {str(key).lower(): one for key, one in _inner(entries).items()}
     try:
-        size = int(data["image_width"]), int(data["image_height"])
-        k = [float(value) for value in data["camera_matrix"]["data"]]
-        d = [float(value) for value in data.get("distortion_coefficients", {}).get("data", [])]
-        model = str(data.get("distortion_model", "none"))
+        size = _size(entries)
+        k = _listed(next(entries[name] for name in _MATRIX if name in entries))
+        d = _listed(next((entries[name] for name in _DISTORTION if name in entries), ()))
+        model = str(entries.get("distortion_model", "plumb_bob" if len(d) <= 5 else "rational_polynomial"))
         if len(k) != 9:
-            raise ValueError(f"camera_matrix has {len(k)} numbers, expected 9")
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise ValueError(f"the matrix has {len(k)} numbers, expected 9")
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, StopIteration) as error:
         raise OpenArmError(
             Code.CONFIG_INVALID,
             f"{path} is no camera_info: {type(error).__name__}: {brief(str(error))}; expected image_width,"
-            " image_height, camera_matrix and distortion_coefficients with data, distortion_model",
+            " image_height, camera_matrix (or K) and distortion_coefficients (or D), distortion_model",
         ) from error
     return lens_of(size, k, model, d, str(path))
+
+
+def _inner(entries: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of a mapping within, such as `camera`, where the matrix is there."""
+    every = (value for value in entries.values() if isinstance(value, dict))
+    return next((one for one in every if {str(key).lower() for key in one} & {*_MATRIX} - {"matrix"}), {})  # pyright: ignore
+
+
+def _size(entries: dict[str, Any]) -> tuple[int, int]:
+    for width, height in _SIZES:
+        if width in entries and height in entries:
+            return int(entries[width]), int(entries[height])
+    for name in ("image_size", "resolution", "size"):
+        if name in entries:
+            width, height = _listed(entries[name])
+            return int(width), int(height)
+    raise KeyError("image_width")
+
+
+def _listed(value: Any) -> list[float]:
+    """Return the numbers of a list, nested or not, of FileStorage's matrix, or of fx, fy, cx and cy."""
+    if isinstance(value, dict):
+        if "data" in value:
+            return _listed(value["data"])  # pyright: ignore[reportUnknownArgumentType]
+        fx, fy, cx, cy = (float(value[name]) for name in ("fx", "fy", "cx", "cy"))  # pyright: ignore
+        return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    return np.array(value, dtype=np.float64).ravel().tolist()
 
 
 def camera_info(name: str, lens: Lens) -> str:

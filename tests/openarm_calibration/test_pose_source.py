@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from openarm_calibration.foreign.conventions import checked_form, read
+from openarm_calibration.foreign.optics import read_camera_info
 from openarm_calibration.foreign.pose_source import Column, read_source
 from openarm_common.errors import Code
 from tests.openarm_calibration import foreign_files as files
@@ -185,3 +186,24 @@ def test_what_can_not_be_read_is_refused_with_what_is_and_what_to_type(tmp_path,
     (tmp_path / name).write_text(text)
     with refuses(Code.CONFIG_INVALID, words):
         read_source(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a.yml", "a.xml", "a.json"])
+def test_intrinsics_that_opencv_writes_are_read(tmp_path: Path, name: str) -> None:
+    file = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+    file.write("image_width", files.K.width)
+    file.write("image_height", files.K.height)
+    file.write("camera_matrix", files.K.matrix)
+    file.write("distortion_coefficients", np.array([[-0.2, 0.05, 0.001, 0.0, 0.01]]))
+    file.release()
+    lens = read_camera_info(tmp_path / name)
+    assert np.array_equal(lens.intrinsics.matrix, files.K.matrix)
+    assert (lens.model, lens.coefficients) == ("plumb_bob", (-0.2, 0.05, 0.001, 0.0, 0.01))
+
+
+def test_a_matrix_by_columns_is_told_by_its_zeros(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(json.dumps({"camera": {"K": files.K.matrix.T.tolist(), "image_size": [640, 480]}}))
+    assert np.array_equal(read_camera_info(tmp_path / "a.json").intrinsics.matrix, files.K.matrix)
+    (tmp_path / "b.json").write_text(json.dumps({"K": files.K.matrix.tolist()}))
+    with refuses(Code.CONFIG_INVALID, "image_width"):
+        read_camera_info(tmp_path / "b.json")
