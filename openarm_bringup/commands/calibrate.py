@@ -278,6 +278,6 @@ def _line(item: StoredCalibration) -> str:
     seed = "none" if item.mount_seed is None else str(item.mount_seed)
     return (
         f"{item.camera}: {x:.2f}, {y:.2f}, {z:.2f} mm in {item.parent},"
-        f" predicted error {item.sigma_translation * 1e3:.3f} mm, {item.samples} samples,"
+        f" accurate to {item.sigma_translation * 1e3:.3f} mm, {item.samples} samples,"
         f" mount seed {seed}, {item.created or 'undated'}"
     )

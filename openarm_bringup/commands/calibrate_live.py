@@ -231,7 +231,7 @@ class _Show(GraphReport):
         sigma = ""
         if feedback.sigma_translation:
             degrees = math.degrees(feedback.sigma_rotation)
-            sigma = f"predicted error {feedback.sigma_translation * 1e3:.3f} mm {degrees:.4f}°"
+            sigma = f"repeatable to {feedback.sigma_translation * 1e3:.3f} mm {degrees:.4f}°"
         line = f"pose {feedback.pose:>2} of {feedback.poses}  {feedback.stage:<9}{sigma:<42}{feedback.message}"
         if line != self._last:
             self._last = line
@@ -249,7 +249,7 @@ def _outcome(results: dict[str, AutoCalibrate.Result], error: OpenArmError | Non
             continue
         x, y, z = xyz(result.mount.position) * 1e3
         lines.append(
-            f"{name}: {x:.2f}, {y:.2f}, {z:.2f} mm, predicted error {result.sigma_translation * 1e3:.3f} mm"
+            f"{name}: {x:.2f}, {y:.2f}, {z:.2f} mm, accurate to {result.sigma_translation * 1e3:.3f} mm"
             f" {math.degrees(result.sigma_rotation):.4f}°, {result.samples} samples in {result.duration:.0f} s;"
             f" {result.message}"
         )

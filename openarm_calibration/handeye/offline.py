@@ -7,12 +7,14 @@ where the arm had the same posture, and the mount of the board where both use th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from openarm_calibration.handeye.accuracy import accuracy_of
 from openarm_calibration.handeye.choice import solve_chosen
 from openarm_calibration.handeye.closed_form import REFINED, checked_algorithm, closed_form
 from openarm_calibration.handeye.left_out import side_by_side
@@ -119,7 +121,13 @@ def judged(
     before = None if stored is None else stored.T_parent_link @ T_LINK_OPTICAL
     verdict = assess(problem, solution, limits, before)
     X = solution.estimate.X[0]
-    sigma_t, sigma_r = verdict.figures["accuracy_translation"], verdict.figures["accuracy_rotation"]
+    figures = verdict.figures
+    if problem.joints:
+        by_zeros = accuracy_of(samples, X)
+        for name, value in (("translation", by_zeros.translation), ("rotation", by_zeros.rotation)):
+            figures[f"accuracy_{name}"] = math.hypot(figures[f"accuracy_{name}"], value)
+        figures.update(hand=by_zeros.hand, zeros_sigma=by_zeros.zeros)
+    sigma_t, sigma_r = figures["accuracy_translation"], figures["accuracy_rotation"]
     if algorithm == REFINED and verdict.closed_form:
         algorithm = verdict.closed_form
     if algorithm != REFINED:

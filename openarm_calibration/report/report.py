@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 from openarm_calibration.handeye.offline import Result
 from openarm_calibration.handeye.zero_sets import ZerosCalibration
@@ -22,9 +23,11 @@ def summary(result: Result) -> str:
     lines = [
         f"{result.calibration.camera} on {result.calibration.parent}, {f['samples']} poses, {result.calibration.board}",
         "position     " + "  ".join(f"{v * 1e3:9.2f}" for v in result.calibration.position) + " mm",
-        f"predicted    {f['sigma_translation'] * 1e3:.3f} mm, {math.degrees(f['sigma_rotation']):.4f}°"
+        f"repeatable   to {f['sigma_translation'] * 1e3:.3f} mm, {math.degrees(f['sigma_rotation']):.4f}°"
         f"  (marks {f['px']:.3f} px,"
         f" robot {f['robot_translation'] * 1e3:.3f} mm {math.degrees(f['robot_rotation']):.4f}°)",
+        f"accurate     to {f['accuracy_translation'] * 1e3:.3f} mm, {math.degrees(f['accuracy_rotation']):.4f}°"
+        f" in the frame of {result.calibration.parent}{_by_zeros(f)}",
         f"held out     {f['leave_one_out'] * 1e3:.3f} mm, {f['leave_one_out_px']:.3f} px (leave one out);"
         f" {f['five_fold'] * 1e3:.3f} mm, {f['five_fold_px']:.3f} px (five folds)",
         f"board scale  {f['scale']:.5f} ± {f['scale_sigma']:.5f}    condition {f['condition']:.2g}",
@@ -45,6 +48,14 @@ def summary(result: Result) -> str:
             away = f"{row['translation'] * 1e3:8.3f} mm {math.degrees(row['rotation']):8.4f}°"
             lines.append(f"  {name:<12} {away} {row['px']:8.3f} px")
     return "\n".join(lines)
+
+
+def _by_zeros(figures: dict[str, Any]) -> str:
+    """Return what zeros of the joints that may be off do to mount and hand, in words; "" where joints are not known."""
+    if "hand" not in figures:
+        return ""
+    zeros, hand = math.degrees(figures["zeros_sigma"]), figures["hand"] * 1e3
+    return f" (zeros of joints ± {zeros:.3f}°); the hand meets what the camera sees to {hand:.3f} mm"
 
 
 def zeros_page(found: ZerosCalibration) -> str:

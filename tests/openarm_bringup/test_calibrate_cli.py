@@ -36,7 +36,7 @@ def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_p
     assert calibrate(capsys, "list")[1].startswith("0 stored")
     code, out, _ = calibrate(capsys, "save", str(session_file))
     assert code == 0
-    assert all(part in out for part in ("predicted", "DANIILIDIS", "Stored in"))
+    assert all(part in out for part in ("repeatable   to", "accurate     to", "DANIILIDIS", "Stored in"))
     assert calibrate(capsys, "save", str(session_file), "--algorithm", "park", "--force")[0] == 0
     code, out, _ = calibrate(capsys, "list")
     assert "2 in its history" in out
