@@ -131,8 +131,8 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
     arm = solution.estimate.noise
     by_zeros = "wrong joint zeros; find them by `openarm calibrate zeros`" if problem.joints else _OF_POSES
     checks = [
-        Check("position", sigma_t / limits.translation, f"predicted error of the position {sigma_t * 1e3:.3f} mm"),
-        Check("rotation", sigma_r / limits.rotation, f"predicted error of the rotation {math.degrees(sigma_r):.4f}°"),
+        Check("position", sigma_t / limits.translation, f"repeatability of the position {sigma_t * 1e3:.3f} mm"),
+        Check("rotation", sigma_r / limits.rotation, f"repeatability of the rotation {math.degrees(sigma_r):.4f}°"),
         Check(
             "held out", one_out.metres / limits.held_out, f"held-out error {one_out.metres * 1e3:.3f} mm at the board"
         ),
