@@ -18,15 +18,18 @@ from openarm_calibration.board.board import Board
 from openarm_calibration.board.circles import SymmetricCircles
 from openarm_calibration.board.detect import detect, guess_pose
 from openarm_calibration.board.detection import BoardDetection, plane_fit
-from openarm_calibration.board.orientation import fronts, upright
+from openarm_calibration.board.orientation import fronts
 from openarm_calibration.board.squares import Chessboard
 from openarm_calibration.foreign.conventions import Convention
 from openarm_calibration.foreign.explain import BOARD_FRAMES, Poses, Tried, decided, search, table
 from openarm_calibration.foreign.optics import Lens
 from openarm_calibration.foreign.pose_robot import joints_of_pose, robot_of_poses
 from openarm_calibration.foreign.pose_source import Source
+from openarm_calibration.handeye.consensus import agreed
 from openarm_calibration.handeye.problem import Setup
+from openarm_calibration.handeye.transforms import inverses
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
+from openarm_common import se3
 from openarm_common.config import validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -34,6 +37,8 @@ from openarm_common.types import Array
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 #: Largest image file, bytes.
 _LARGEST = 64 * 2**20
+#: Of settling in which way boards are read.
+_ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,6 @@ class ImageSet:
 
     samples: SampleSet
     tried: tuple[Tried, ...]
-    chosen: Tried
     rows: list[dict[str, Any]]
 
     @property
@@ -117,8 +121,13 @@ def found_in(board: Board, image: NDArray[np.uint8], lens: Lens) -> tuple[BoardD
     return detection, guess_pose(board.points[seen.ids], detection.pixels, board.radius, lens.intrinsics)[0]
 
 
-#: A view: which pose, the marks without distortion, T_camera_board (4, 4), and the rectified image as PNG.
-_View = tuple[int, BoardDetection, Array, bytes]
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A board in an image: its marks without distortion, T_camera_board (4, 4), and the rectified image as PNG."""
+
+    detection: BoardDetection
+    pose: Array
+    png: bytes = b""
 
 
 def image_set(
@@ -149,12 +158,11 @@ def image_set(
             (label, partial(_marks, corners.rows[k], label, board, lens)) for k, label in enumerate(corners.labels)
         ]
     rows: list[dict[str, Any]] = []
-    found: list[_View] = []
+    found: dict[int, list[_View]] = {}
     for k, (name, look) in enumerate(looks):
         row = {"image": name, "sample": "", "reason": ""}
         try:
-            detection, C, png = look()
-            found.append((k, detection, C, png))
+            found[k] = look()
             row["sample"] = f"s{len(found):03d}"
         except OpenArmError as error:
             row["reason"] = error.message
@@ -166,41 +174,84 @@ def image_set(
             f"too few poses: the board is in {len(found)} of {len(looks)} images, at least 3 are needed"
             + (f"; such as: {why}" if why else ""),
         )
-    kept = [k for k, *_ in found]
-    seen = np.array([C for _, _, C, _ in found])
-    poses_of_board = Poses(seen.reshape(-1, 16), BOARD_FRAMES, "matrix", "m")
+    kept = list(found)
     used = replace(robot, rows=robot.rows[kept], names=tuple(rows[k]["image"] for k in kept))
-    tried = search(used, poses_of_board, (setup,))
-    chosen = decided(tried, (setup,), used, poses_of_board)
-    samples = _samples(found, chosen.robot, robot.rows, board, lens, setup, names)
-    return ImageSet(samples, tried, chosen, rows)
+    views, board_poses, tried = _read_alike([found[k] for k in kept], used, setup)
+    chosen = decided(tried, (setup,), used, board_poses)
+    samples = _samples(dict(zip(kept, views, strict=True)), chosen.robot, robot.rows, board, lens, setup, names)
+    return ImageSet(samples, tried, rows)
 
 
-def _look(file: Path, board: Board, lens: Lens) -> tuple[BoardDetection, Array, bytes]:
-    """Return the marks in an image, T_camera_board (4, 4), and the rectified image."""
+def _read_alike(ways: list[list[_View]], robot: Poses, setup: Setup) -> tuple[list[_View], Poses, tuple[Tried, ...]]:
+    """Return boards read so that most of them agree, their poses, and the conventions that were tried.
+
+    Args:
+        ways: In which the board in each image can be read.
+        robot: Its poses.
+        setup: in_hand or to_hand.
+    """
+    views, rounds = [way[0] for way in ways], 0
+    while True:
+        board = Poses(np.array([view.pose.ravel() for view in views]), BOARD_FRAMES, "matrix", "m")
+        tried = search(robot, board, (setup,))
+        best = next((one for one in tried if one.given), tried[0])
+        A = best.robot.poses(robot.rows)
+        assert A is not None  # it was tried
+        B = inverses(A) if best.setup == "in_hand" else A
+        common = agreed(B, np.array([view.pose for view in views]))
+        expected = se3.inverse(common.X) @ B @ common.Z
+        turned = [
+            min(way, key=lambda view, T=T: se3.angle_between(view.pose[:3, :3], T[:3, :3]))
+            for way, T in zip(ways, expected, strict=True)
+        ]
+        rounds += 1
+        if turned == views or rounds == _ROUNDS:
+            return views, board, tried
+        views = turned
+
+
+def _look(file: Path, board: Board, lens: Lens) -> list[_View]:
+    """Return the board in an image, in each way in which it can be read; as it stands upright first."""
     image = image_of(file, lens)
     detection, C = found_in(board, image, lens)
-    return detection, C, cv2.imencode(".png", lens.rectified(image))[1].tobytes()
+    png = cv2.imencode(".png", lens.rectified(image))[1].tobytes()
+    out = [_View(detection, C, png)]
+    grid = isinstance(board, Chessboard | SymmetricCircles) and board.ambiguity
+    if grid and len(detection.ids) == len(board.points):
+        out += [_read_as(board, order, lens, png) for order in _orders(board, detection.pixels)]
+    return out
 
 
-def _marks(corners: Array, label: str, board: Board, lens: Lens) -> tuple[BoardDetection, Array, bytes]:
-    """Return the marks of a list of corners (m, 2) px, in the order of the board or the other way round."""
+def _marks(corners: Array, label: str, board: Board, lens: Lens) -> list[_View]:
+    """Return the board of a list of corners (m, 2) px, in each way in which it can be read; as it is listed first."""
     if len(corners) != len(board.points):
         raise OpenArmError(
             Code.NOTHING_DETECTED, f"{label} has {len(corners)} corners, {board.label} has {len(board.points)}"
         )
     pixels = lens.undistorted(corners)
+    orders = [pixels]
     if isinstance(board, Chessboard | SymmetricCircles):
         plane, (rows, columns) = board.points[:, :2], (board.rows, board.columns)
         by_columns = np.ascontiguousarray(pixels.reshape(columns, rows, 2).transpose(1, 0, 2).reshape(-1, 2))
         listed = min(pixels, by_columns, key=lambda order: plane_fit(plane, fronts(plane, order, rows, columns)[0])[0])
-        pixels = upright(fronts(plane, listed, rows, columns), rows, columns)
+        orders = _orders(board, listed)
+    return [_read_as(board, order, lens) for order in orders]
+
+
+def _orders(board: Any, pixels: Array) -> list[Array]:
+    """Return the orders of marks (n, 2) in which they are the image of the board's front; as they are first."""
+    orders = fronts(board.points[:, :2], pixels, board.rows, board.columns)
+    return sorted(orders, key=lambda order: not np.array_equal(order, pixels))
+
+
+def _read_as(board: Board, pixels: Array, lens: Lens, png: bytes = b"") -> _View:
+    """Return the view of all marks (n, 2) of a board."""
     T, residual = guess_pose(board.points, pixels, board.radius, lens.intrinsics)
-    return BoardDetection(np.arange(len(pixels)), pixels, residual), T, b""
+    return _View(BoardDetection(np.arange(len(pixels)), pixels, residual), T, png)
 
 
 def _samples(
-    found: list[_View], convention: Convention, rows: Array, board: Board, lens: Lens, setup: Setup, names: Names
+    found: dict[int, _View], convention: Convention, rows: Array, board: Board, lens: Lens, setup: Setup, names: Names
 ) -> SampleSet:  # fmt: skip
     """Return the samples, whose robot is that of poses."""
     A = convention.poses(rows)
@@ -215,10 +266,10 @@ def _samples(
         robot_of_poses(names.base, names.tip),
         foreign=True,
     )
-    for k, detection, C, png in found:
+    for k, view in found.items():
         t_ns = (k + 1) * 10**9
         name = f"s{len(samples) + 1:03d}"
-        samples.add(Sample(name, t_ns, t_ns, joints_of_pose(A[k]), 0.0, detection, C, png))
+        samples.add(Sample(name, t_ns, t_ns, joints_of_pose(A[k]), 0.0, view.detection, view.pose, view.png))
     return samples
 
 

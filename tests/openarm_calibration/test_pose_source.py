@@ -12,9 +12,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from openarm_calibration.board.board import read_board
 from openarm_calibration.foreign.conventions import checked_form, read
-from openarm_calibration.foreign.optics import read_camera_info
+from openarm_calibration.foreign.explain import ROBOT_FRAMES, Poses
+from openarm_calibration.foreign.image_sets import Names, image_set
+from openarm_calibration.foreign.optics import Lens, read_camera_info
 from openarm_calibration.foreign.pose_source import Column, read_source
+from openarm_calibration.handeye.problem import project
+from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.handeye.solve import solve
 from openarm_common.errors import Code
 from tests.openarm_calibration import foreign_files as files
 from tests.refusals import refuses
@@ -166,6 +172,25 @@ def test_corners_without_pictures_come_with_the_poses(tmp_path: Path) -> None:
     assert source.corners is not None
     assert source.corners.rows == pytest.approx(corners)
     assert poses(source.robot) == pytest.approx(A)
+
+
+@pytest.mark.parametrize("spelling", ["chessboard:4x3:40mm", "chessboard:5x3:30mm", "symmetric_circles:5x4:30mm:12mm"])
+def test_lists_of_corners_that_begin_at_either_end_are_read_alike(tmp_path: Path, spelling: str) -> None:
+    """By rows or by columns, and turned by half in four of eleven views; the poses of the robot tell."""
+    known, board = files.truth("in_hand", 11, seed=3), read_board(spelling)
+    row = np.array([files.K.fx, files.K.fy, files.K.cx, files.K.cy])
+    records = []
+    for k, (a, c) in enumerate(zip(known.A, known.C, strict=True)):
+        corners = project(board.points, board.radius, c, row).reshape(board.rows, board.columns, 2)
+        corners = corners[::-1, ::-1] if k in (0, 4, 5, 9) else corners
+        corners = corners.transpose(1, 0, 2) if spelling == "chessboard:5x3:30mm" else corners
+        records.append({"image_points": corners.reshape(-1, 2).tolist(), "T_base_hand": a.tolist()})
+    (tmp_path / "views.json").write_text(json.dumps(records))
+    source = read_source(tmp_path / "views.json")
+    robot = Poses(source.robot.rows, ROBOT_FRAMES, names=source.robot.labels)
+    found = image_set(source, None, board, Lens(files.K), robot, "in_hand", Names())
+    solution = solve(found.samples.problem())
+    assert mount_error(solution.estimate.X[0], known.X)[0] < 1e-4
 
 
 @pytest.mark.parametrize(
