@@ -46,10 +46,10 @@ class Foreign:
         board_frames: T_camera_board is the pose of the board in the camera (when not given), T_board_camera the
             inverse.
         fix: Place of the camera along an axis of its parent, such as z=0.12 (m): an arm of four axes does not tell it.
-        image_topic: Of a bag: Image or CompressedImage; the only one when not given.
-        info_topic: Of a bag: CameraInfo; that next to the images when not given.
-        joint_topic: Of a bag: JointState; /joint_states when not given; "tf" takes the pose of the tip from /tf.
-        urdf: Of a bag: file of the robot's description where /robot_description was not recorded.
+        image_topic: Image or CompressedImage of a bag; the only one when not given.
+        info_topic: CameraInfo of a bag; that next to the images when not given.
+        joint_topic: JointState of a bag; /joint_states when not given; "tf" takes the pose of the tip from /tf.
+        urdf: File of the robot's description where a bag has no /robot_description.
         session: File (.npz) to write samples with images to, for the other commands.
         store: Folder of stored calibrations.
         save: Store the result, unless it fails.

@@ -27,7 +27,7 @@ def detect(board: Board, image: Grey) -> BoardDetection:
     """Find a board.
 
     Args:
-        board: Which.
+        board: Board to find.
         image: (h, w) grey.
 
     Raises:
@@ -53,8 +53,8 @@ def guess_pose(points: Array, pixels: Array, radius: float, intrinsics: Intrinsi
     Args:
         points: (n, 3) marks in the board frame, m, z = 0.
         pixels: (n, 2).
-        radius: Of the circles, m.
-        intrinsics: Of the camera.
+        radius: Radius of the circles, m.
+        intrinsics: Intrinsics of the camera.
 
     Returns:
         (4, 4) T_camera_board, refined, the better of the two that a plane allows.

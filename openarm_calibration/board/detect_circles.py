@@ -63,7 +63,7 @@ def refined(image: Grey, centres: Array, plane: Array, radius: float, H: Array) 
         image: (h, w) grey.
         centres: (n, 2) within 0.4 radii, px.
         plane: (n, 2) circle centres on the board, m.
-        radius: Of the circles, m; nothing but white within 1.85 radii of a centre, in half of the directions or more.
+        radius: Radius, m; nothing but white within 1.85 radii of a centre, in half of the directions or more.
         H: (3, 3) homography from the plane to pixels.
 
     Returns:

@@ -163,7 +163,7 @@ def _markers(dictionary: str, image: Grey, border_bits: int, wanted: int) -> dic
     """Return the corners (4, 2) of all markers by id; an id that is there twice is left out.
 
     Args:
-        dictionary: Of the codes.
+        dictionary: Name of the dictionary of the codes.
         image: (h, w) grey.
         border_bits: Modules of black around the code.
         wanted: Markers; where fewer are found, the image is enlarged.

@@ -43,7 +43,7 @@ class Convention:
 
     Args:
         rotation: A name of `FORMS`.
-        unit: Of positions.
+        unit: Unit of positions.
         frames: "T_base_tip" of a robot, "T_camera_board" of a board.
         inverse: Whether they are the other way round.
     """
@@ -146,7 +146,7 @@ def readings(rows: Array, frames: str, names: Sequence[str] = ()) -> tuple[Conve
 
     Args:
         rows: (n, k) numbers of poses.
-        frames: Of the convention.
+        frames: Name of the transform, such as T_base_tip.
         names: (n,) of the records, for the error.
 
     Raises:

@@ -78,14 +78,14 @@ class Tried:
 
     Args:
         setup: in_hand or to_hand.
-        robot: Of the robot's poses.
-        board: Of the board's.
+        robot: Convention of the robot's poses.
+        board: Convention of the board's.
         translation: Deviation of a pair by axis, m at the board; by medians.
         rotation: The same, rad.
         share: The larger of the two as a share of what remains of poses that have nothing to do with each other.
         score: The mean of both shares, geometric; smaller is better.
-        scale: By which the lengths of the board's poses are to be multiplied; 1 unless the board is of another size.
-        given: Whether it is what is stated.
+        scale: Factor for the lengths of the board's poses; 1 unless the board is of another size.
+        given: True where it is what is stated.
         consensus: Mounts, in the robot's own unit.
     """
 
@@ -176,10 +176,10 @@ def decided(tried: tuple[Tried, ...], setups: Sequence[Setup], robot: Poses, boa
     """Return the convention that explains the poses.
 
     Args:
-        tried: As `search` returns them.
+        tried: Conventions that `search` returned.
         setups: Kinds of cameras that are stated.
-        robot: As of `search`.
-        board: As of `search`.
+        robot: Poses that `search` was given.
+        board: The same of the board.
 
     Raises:
         Unexplained: When none explains the poses, another one than the stated does, or several do.

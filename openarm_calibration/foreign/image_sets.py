@@ -81,7 +81,7 @@ def grey_of(data: bytes, lens: Lens, where: str) -> NDArray[np.uint8]:
 
     Args:
         data: PNG, JPEG and the like.
-        lens: Whose size it must have, which its header is asked for before anything is unpacked.
+        lens: Camera whose size it must have; its header is asked before anything is unpacked.
         where: Begins the error.
 
     Raises:
@@ -109,9 +109,9 @@ def found_in(board: Board, image: NDArray[np.uint8], lens: Lens) -> tuple[BoardD
     """Return the marks of a board without the lens's distortion, and T_camera_board (4, 4) by them.
 
     Args:
-        board: To find.
+        board: Board to find.
         image: (h, w) grey, as the camera took it.
-        lens: Of the camera.
+        lens: Lens of the camera.
 
     Raises:
         OpenArmError: NOTHING_DETECTED; BAD_IMAGE.
@@ -137,12 +137,12 @@ def image_set(
 
     Args:
         source: Poses of the robot, one for each image, and corners where there are no images.
-        folder: Of the images; in the order of their names where the source has no names.
-        board: In the images.
-        lens: Of the camera.
+        folder: Images, in the order of their names where the source names none.
+        board: Board in the images.
+        lens: Lens of the camera.
         robot: The same poses, and what is stated of them.
         setup: in_hand or to_hand.
-        names: Of camera and frames.
+        names: Names of camera and frames.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when images and poses do not fit together; DEGENERATE, with too few boards, or
@@ -186,7 +186,7 @@ def _read_alike(ways: list[list[_View]], robot: Poses, setup: Setup) -> tuple[li
     """Return boards read so that most of them agree, their poses, and the conventions that were tried.
 
     Args:
-        ways: In which the board in each image can be read.
+        ways: Views of each image, one for each way to read its board.
         robot: Its poses.
         setup: in_hand or to_hand.
     """

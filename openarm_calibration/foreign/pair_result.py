@@ -100,12 +100,12 @@ def pair_result(
     """Solve pairs and grade the result.
 
     Args:
-        pairs: Of the camera.
-        names: Of camera and frames.
+        pairs: Pairs of one camera.
+        names: Names of camera and frames.
         limits: None is the defaults.
         created: When, as ISO 8601.
-        fixed: As of `solve_pairs`.
-        scale: By which the lengths of the board would have to be multiplied.
+        fixed: Place of the camera that `solve_pairs` is given.
+        scale: Factor that the lengths of the board lack.
 
     Raises:
         OpenArmError: As `solve_pairs`.

@@ -38,7 +38,7 @@ class Column:
     """What has the same name in each record.
 
     Args:
-        name: As its file calls it.
+        name: Name in its file.
         rows: (n, k) numbers of poses, position first; of corners (n, m, 2) px.
         labels: (n,) of the records.
         rotation: Form that the file tells; "" where it does not.

@@ -42,7 +42,7 @@ class Source:
         board: Poses of the board in the camera; None where there are none.
         corners: Corners of the board in the images; None where there are none.
         images: (n,) names of images; () where they are not named.
-        kind: Of the camera, as the file says; "" where it does not.
+        kind: Kind of the camera that the file states; "" where it does not.
         frames: Names of base, tip and camera, where the file has them.
     """
 

@@ -35,10 +35,10 @@ class Accuracy:
     """Deviations of vectors.
 
     Args:
-        translation: Of the mount's position, m.
-        rotation: Of its rotation, rad.
-        hand: Of the tool centre point from where the camera sees it, m.
-        zeros: Of the zero of a joint, rad.
+        translation: Deviation of the mount's position, m.
+        rotation: Deviation of its rotation, rad.
+        hand: Distance of the tool centre point from where the camera sees it, rms, m.
+        zeros: Deviation of a joint's zero, rad.
     """
 
     translation: float
@@ -51,7 +51,7 @@ def accuracy_of(samples: SampleSet, X: Array) -> Accuracy:
     """Return how wrong a mount may be.
 
     Args:
-        samples: Of one camera, on a robot whose joints are known.
+        samples: Samples of one camera, on a robot whose joints are known.
         X: (4, 4) its mount, by the joints as they are reported.
 
     Raises:
@@ -83,8 +83,8 @@ class _Hand:
     Args:
         setup: in_hand or to_hand.
         X: (4, 4) the mount in use.
-        tip: From the base to the tool centre point.
-        carrier: From the base to the link that carries the camera.
+        tip: Chain from the base to the tool centre point.
+        carrier: Chain from the base to the link that carries the camera.
         postures: Positions that the encoders report.
     """
 

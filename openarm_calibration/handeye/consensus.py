@@ -38,7 +38,7 @@ class Consensus:
     Args:
         X: (4, 4) of the camera, in the robot's unit.
         Z: (4, 4) of the board.
-        scale: By which lengths in the camera's poses are to be multiplied.
+        scale: Factor for lengths in the camera's poses.
         translations: (n,) distance of each board from where the mounts predict it, in the robot's unit.
         rotations: (n,) the same, rad.
         free: (3,) direction along which the camera may be anywhere; zero where the pairs determine it.
@@ -65,7 +65,7 @@ def agreed(B: Array, C: Array, *, scaled: bool = False, rounds: int = ROUNDS) ->
         B: (n, 4, 4) from the board's to the camera's carrier.
         C: (n, 4, 4) T_camera_board.
         scaled: Whether lengths in C are in a unit of their own.
-        rounds: Of weights; a few tell whether poses agree at all.
+        rounds: Number of rounds of weights; a few tell whether poses agree at all.
     """
     RB, RC = B[:, :3, :3], C[:, :3, :3]
     shared = _one_axis(RB, RC)

@@ -93,7 +93,7 @@ class PairSolution:
         noise: Estimated deviations of a pair by axis, m and rad.
         used: (n,) pairs that it rests on.
         left_out: Prediction of left-out pairs by method; what a method fails with is its message.
-        method: Whose X and Z these are: the refinement unless a closed form predicts better.
+        method: Method of X and Z: the refinement unless a closed form predicts better.
         distance: (n,) squared distance of each pair over its expectation.
         free: (3,) direction along which the camera may be anywhere; zero where the pairs determine it.
     """
@@ -143,7 +143,7 @@ def solve_pairs(pairs: PosePairs, fixed: Mapping[str, float] | None = None) -> P
     Where all rotations are about one axis (an arm of four axes) five numbers of the camera's mount are determined.
 
     Args:
-        pairs: Of one camera and board.
+        pairs: Pairs of one camera and board.
         fixed: Position of the camera along an axis of its parent, `x`, `y` or `z`, m, where the pairs do not tell it.
 
     Raises:
