@@ -134,6 +134,8 @@ def _of_pairs(path: Path, source: Source, given: Foreign) -> Outcome:
     message = f"{result.grade}: {'; '.join(result.reasons) or 'within all limits'}"
     if source.kind in KINDS and KINDS[source.kind] != setup:
         message += f" ({path} says {source.kind}; the poses say {KIND[setup]})"
+    if source.left_out:
+        message += f" (a pose of one of the two only: {', '.join(source.left_out)})"
     data = {"format": "pairs", "conventions": [one.as_json() for one in tried], **result.as_json()}
     text = f"{table(tried[:1])}\n\n{result.text}"
     if result.grade == "fail":

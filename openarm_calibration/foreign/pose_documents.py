@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,11 @@ class Column:
     def corners(self) -> bool:
         """Whether these are corners in images."""
         return self.rows.ndim == 3
+
+    def subset(self, chosen: list[int]) -> Column:
+        """Return some of the records."""
+        labels = tuple(self.labels[k] for k in chosen)
+        return replace(self, rows=self.rows[chosen], labels=labels)
 
     def inverse(self, whose: str) -> bool:
         """Whether its name says that the poses are the other way round; `whose` is robot or board."""

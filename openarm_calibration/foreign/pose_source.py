@@ -44,6 +44,7 @@ class Source:
         images: (n,) names of images; () where they are not named.
         kind: Kind of the camera that the file states; "" where it does not.
         frames: Names of base, tip and camera, where the file has them.
+        left_out: Records that have a pose of one of the two only.
     """
 
     robot: Column
@@ -52,6 +53,7 @@ class Source:
     images: tuple[str, ...] = ()
     kind: str = ""
     frames: Mapping[str, str] = field(default_factory=dict[str, str])
+    left_out: tuple[str, ...] = ()
 
 
 def kind_of(name: str, what: str) -> Setup:
@@ -89,7 +91,12 @@ def read_source(path: Path, other: Path | None = None, columns: str = "") -> Sou
                 f"{path} has the poses {_listed(found)} and {other} {_listed(more)}; expected one column in each",
             )
         found = [_named(found[0], "robot"), _named(more[0], "board")]
-    robot, board, corners = _told_apart(path, found)
+    robot, second = _told_apart(path, found)
+    left_out: tuple[str, ...] = ()
+    if second is not None:
+        robot, second, left_out = _aligned(path, robot, second)
+    board = None if second is None or second.corners else second
+    corners = second if second is not None and second.corners else None
     said: Any = document.get("parameters") if isinstance(document, dict) else None  # pyright: ignore
     about = {key: str(value) for key, value in said.items()} if isinstance(said, dict) else {}  # pyright: ignore
     kind = about.get("calibration_type", "")
@@ -102,7 +109,7 @@ def read_source(path: Path, other: Path | None = None, columns: str = "") -> Sou
         key: about.get(f"{name}_frame", "")
         for key, name in (("base", "robot_base"), ("tip", "robot_effector"), ("camera", "tracking_base"))
     }
-    return Source(robot, board, corners, images, kind, frames)
+    return Source(robot, board, corners, images, kind, frames, left_out)
 
 
 def _named(column: Column, name: str) -> Column:
@@ -148,42 +155,53 @@ def _listed(columns: Sequence[Column]) -> str:
     return ", ".join(f"{one.name!r} ({len(one.rows)})" for one in columns[:8]) or "none"
 
 
-def _told_apart(path: Path, found: list[Column]) -> tuple[Column, Column | None, Column | None]:
-    """Return the robot's poses, the board's, and corners, by names and counts."""
+def _told_apart(path: Path, found: list[Column]) -> tuple[Column, Column | None]:
+    """Return the robot's poses, and those of the board or its corners, by names."""
     corners = [one for one in found if one.corners]
     poses = [one for one in found if not one.corners]
-    count = max((len(one.rows) for one in poses), default=0)
-    whole = next((one for one in poses if len(one.rows) == count), None)
-    for one in poses:
-        if whole is not None and count / 2 < len(one.rows) < count:
-            missing = next((label for label in whole.labels if label not in one.labels), "a record")
-            raise OpenArmError(
-                Code.CONFIG_INVALID,
-                f"{path} has {_listed([whole, one])}: {missing} has no {one.name} that is a pose of finite numbers",
-            )
-    poses = [one for one in poses if len(one.rows) == count]
     if not poses:
         raise OpenArmError(Code.CONFIG_INVALID, f"{path} has no poses; it has {_listed(found)}")
-    pixels = next((one for one in corners if len(one.rows) == count), None)
-    if len(poses) == 1:
-        return poses[0], None, pixels
-
-    def score(column: Column, words: tuple[str, ...]) -> int:
-        parts = re.findall(r"[a-z]+\d*(?=$|[^a-z0-9])|[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", column.name).lower())
-        return sum(part in words for part in parts)
-
     # the frame that moves is named first, or alone: gripper2base, effector_wrt_world, T_base_hand, hand
-    robots = [one for one in poses if score(one, _ROBOT) > score(one, _BOARD)]
-    boards = [one for one in poses if score(one, _BOARD) > score(one, _ROBOT)]
+    robots = [one for one in poses if _score(one, _ROBOT) > _score(one, _BOARD)]
+    boards = [one for one in poses if _score(one, _BOARD) > _score(one, _ROBOT)]
     if len(robots) == 1 and len(boards) == 1:
-        return robots[0], boards[0], pixels
-    if len(poses) == 2 and not (robots or boards):
-        return poses[0], poses[1], pixels
-    if len(poses) == 2 and len(robots) + len(boards) == 1:
-        first = robots[0] if robots else next(one for one in poses if one is not boards[0])
-        return first, next(one for one in poses if one is not first), pixels
+        return robots[0], boards[0]
+    if len(poses) == 2 and len(robots) < 2 and len(boards) < 2:
+        first = robots[0] if robots else next(one for one in poses if one not in boards)
+        return first, next(one for one in poses if one is not first)
+    if len(poses) == 1 or (len(robots) == 1 and corners):
+        return (poses if len(poses) == 1 else robots)[0], max(corners, key=lambda one: len(one.rows), default=None)
     raise OpenArmError(
         Code.CONFIG_INVALID,
         f"{path} has the poses {_listed(poses)}; expected one column of the robot and one of the board, by names such"
         " as robot, hand, gripper2base and board, eye, target2cam; rename them, or give two files: FILE --with FILE",
     )
+
+
+def _score(column: Column, words: tuple[str, ...]) -> int:
+    """Return how many parts of a name are among some words."""
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", column.name).lower()
+    return sum(part in words for part in re.findall(r"[a-z]+\d*(?=$|[^a-z0-9])|[a-z]+", name))
+
+
+def _aligned(path: Path, one: Column, other: Column) -> tuple[Column, Column, tuple[str, ...]]:
+    """Return two columns whose rows belong together, and the records that only one of them has.
+
+    Records are matched by their numbers, where both have such, and by their order otherwise.
+    """
+    keys, others = ([(re.findall(r"\d+", label) or [label])[-1] for label in each.labels] for each in (one, other))
+    shared = {*keys} & {*others}
+    told = len({*keys}) == len(keys) and len({*others}) == len(others) and 2 * len(shared) > min(len(keys), len(others))
+    if told and keys != others:
+        mine = [k for k, key in enumerate(keys) if key in shared]
+        theirs = [others.index(keys[k]) for k in mine]
+        alone = [label for each, known in ((one, keys), (other, others))
+                 for label, key in zip(each.labels, known, strict=True) if key not in shared]  # fmt: skip
+        return one.subset(mine), other.subset(theirs), tuple(alone)
+    if len(keys) != len(others):
+        raise OpenArmError(
+            Code.CONFIG_INVALID,
+            f"{path} has {_listed([one, other])}: not as many of either, and no numbers of records tell which belong"
+            " together",
+        )
+    return one, other, ()

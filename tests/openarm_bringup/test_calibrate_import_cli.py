@@ -136,10 +136,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "bent.yaml").write_text(json.dumps(bent))
     (folder / "deep.json").write_text("[" * 5000)
     (folder / "alias.yaml").write_text("a: &a [1]\nb: *a\n")
-    lines = files.easy_handeye2(folder / "nan.samples", known).read_text().splitlines()
-    second = [k for k, line in enumerate(lines) if line.startswith("- robot")][1]
-    lines[second + 2] = "      x: .nan"
-    (folder / "nan.samples").write_text("\n".join(lines))
     (folder / "many.json").write_text(json.dumps([[np.eye(4).tolist()] * 2] * 2001))
     (folder / "tool.txt").write_text("hello\n")
     (folder / "mapping.yaml").write_text("a: 1\n")
@@ -188,7 +184,6 @@ HAND = ("--camera-kind", "eye_in_hand")
         (("tool.txt", *HAND, *IMAGES), 1, "has no poses"),
         (("words.samples", *HAND), 1, "has no poses that are repeated"),
         (("one.samples", *HAND), 1, "has no poses that are repeated"),
-        (("nan.samples", *HAND), 1, "record 2 has no samples.robot"),
         (("bent.yaml", *HAND), 1, "record 2 is no rotation as matrix by rows"),
         (("pairs.json",), 2, "give --camera-kind"),
         (("pairs.json", *HAND, "--session", "a.npz"), 2, "--session is no option for pairs of poses"),

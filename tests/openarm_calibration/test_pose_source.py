@@ -163,6 +163,23 @@ def test_columns_are_named_by_the_command_line_and_units_by_a_header(tmp_path: P
     assert source.images == tuple(f"{k}.png" for k in range(8))
 
 
+def test_records_belong_together_by_their_numbers_and_half_of_one_is_left_out(tmp_path: Path) -> None:
+    """The board was not found in the third, its pose is not a number in the sixth; and the files differ in order."""
+    records = {f"pose_{k}": {"hand": a.tolist(), "eye": c.tolist()} for k, (a, c) in enumerate(zip(A, C, strict=True))}
+    records["pose_2"]["eye"] = None
+    records["pose_5"]["eye"][0][3] = float("nan")
+    (tmp_path / "a.json").write_text(json.dumps(records))
+    source = read_source(tmp_path / "a.json")
+    whole = [0, 1, 3, 4, 6, 7]
+    assert poses(source.robot) == pytest.approx(A[whole])
+    assert poses(source.board) == pytest.approx(C[whole])
+    assert source.left_out == ("pose_2", "pose_5")
+    for name, T, order in (("b", A, range(8)), ("c", C, (3, 1, 0, 7, 2, 4, 5, 6))):
+        (tmp_path / f"{name}.json").write_text(json.dumps({f"T{k}": T[k].tolist() for k in order}))
+    source = read_source(tmp_path / "b.json", tmp_path / "c.json")
+    assert (poses(source.robot) == pytest.approx(A), poses(source.board) == pytest.approx(C)) == (True, True)
+
+
 def test_corners_without_pictures_come_with_the_poses(tmp_path: Path) -> None:
     corners = np.random.default_rng(0).uniform(0.0, 640.0, (8, 12, 2))
     records = [{"corners": pixels.tolist(), "T_base_hand": a.tolist()} for a, pixels in zip(A, corners, strict=True)]
