@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _OF_BAGS = ("image_topic", "info_topic", "joint_topic", "urdf")
 _OF_VIEWS = ("board", "images", "intrinsics", "session")
 _OF_PAIRS = ("board_rotation", "board_unit", "board_frames", "fix")
-_OF_POSES = ("with_", "columns", "rotation", "unit", "frames")
+_OF_POSES = ("with_", "columns", "roles", "rotation", "unit", "frames")
 _NOT_OF: dict[str, tuple[str, ...]] = {
     "a bag": (*_OF_POSES, *_OF_PAIRS, "images"),
     "pairs of poses": (*_OF_BAGS, *_OF_VIEWS),
@@ -46,7 +46,7 @@ def imported(path: Path, given: Foreign) -> Outcome:
     if path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists():
         _refuse(given, "a bag")
         return _of_bag(path, given)
-    source = read_source(path, given.with_, given.columns)
+    source = read_source(path, given.with_, given.columns, given.roles)
     pairs = source.board is not None and given.images is None
     if not pairs and source.corners is None and given.images is None:
         raise OpenArmError(
@@ -137,7 +137,8 @@ def _of_pairs(path: Path, source: Source, given: Foreign) -> Outcome:
     if source.left_out:
         message += f" (a pose of one of the two only: {', '.join(source.left_out)})"
     data = {"format": "pairs", "conventions": [one.as_json() for one in tried], **result.as_json()}
-    text = f"{table(tried[:1])}\n\n{result.text}"
+    who = f"the robot's poses are {source.robot.name!r}, the board's {source.board.name!r}"
+    text = f"{who}\n{table(tried[:1])}\n\n{result.text}"
     if result.grade == "fail":
         kept = "; not stored" if given.save else ""
         return Outcome(False, message + kept, Code.DEGENERATE, data, text)

@@ -141,6 +141,16 @@ def _of_matrices(rows: Array, by_columns: bool) -> Array | None:
     return T
 
 
+def _mirrored(rows: Array, form: str) -> bool:
+    """Return whether all matrices of rows (n, k) would be rotations but for a mirror."""
+    if form not in ("matrix", "columns"):
+        return False
+    wide = rows.shape[1] // 4
+    M = rows.reshape(-1, 4, wide).swapaxes(1, 2) if form == "columns" else rows.reshape(-1, wide, 4)
+    R = M[:, :3, :3]
+    return bool(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < _LOOSE and (np.linalg.det(R) < 0.0).all())
+
+
 def readings(rows: Array, frames: str, names: Sequence[str] = ()) -> tuple[Convention, ...]:
     """Return the forms that rotations of rows (n, k) may have, each once where several give the same rotations.
 
@@ -175,6 +185,11 @@ def readings(rows: Array, frames: str, names: Sequence[str] = ()) -> tuple[Conve
         if len(names) == len(rows) > len(wrong[form]):
             raise OpenArmError(
                 Code.CONFIG_INVALID, f"{names[wrong[form][0]]} is no rotation as {meaning(form)}; the others are"
+            )
+        if any(_mirrored(rows, form) for form in every):
+            raise OpenArmError(
+                Code.CONFIG_INVALID,
+                "the matrices are left-handed (determinant -1): one axis is the other way round; turn it back",
             )
         raise OpenArmError(
             Code.CONFIG_INVALID,

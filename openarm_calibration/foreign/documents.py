@@ -21,8 +21,12 @@ from openarm_common.printable import brief
 
 #: Largest file of arrays, bytes, and most numbers of one.
 _LARGEST, _MOST_NUMBERS = 64 * 2**20, 10**6
+#: Beginnings of lines that say something of a table; and a decimal comma.
+_COMMENT = ("#", "%", "//")
+_BRACKETS = re.compile(r"\b[XYZABC]\s+(?=[-+.\d])|\bp(?=\[)|[\[\](){}]")
+_DECIMAL = re.compile(r"^([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)$")
 TABLES = (".csv", ".tsv", ".txt", ".tum", ".dat")
-DOCUMENTS = (".yaml", ".yml", ".json", ".xml", ".samples", ".npz", ".npy")
+DOCUMENTS = (".yaml", ".yml", ".json", ".jsonl", ".xml", ".samples", ".npz", ".npy")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +52,31 @@ def read_document(path: Path) -> Any:
     """
     if path.suffix in (".npz", ".npy"):
         return _arrays(path)
-    text = read_text(path)
-    if path.suffix == ".json":
-        return parse_json(text, str(path), Code.CONFIG_INVALID)
+    text = _decoded(path)
     if path.suffix == ".xml":
         return _storage_xml(text, str(path))
+    if path.suffix in (".json", ".jsonl"):
+        lines = [line for line in text.splitlines() if line.strip()]
+        if len(lines) > 1 and all(line.strip()[:1] in "{[" and line.strip()[-1:] in "}]" for line in lines):
+            return [parse_json(line, f"{path}:{k + 1}", Code.CONFIG_INVALID) for k, line in enumerate(lines)]
+        return parse_json(text, str(path), Code.CONFIG_INVALID)
     # FileStorage has a directive that is no YAML, and tags for its matrices
-    plain = re.sub(r"\A%YAML:1\.0\s*(\n---)?", "", text)
-    return parse_yaml(plain.replace("!!opencv-matrix", ""), str(path))
+    plain = re.sub(r"\A%YAML:1\.0\s*(\n---)?", "", text).replace("!!opencv-matrix", "")
+    parts = [part for part in re.split(r"^---\s*$", plain, flags=re.MULTILINE) if part.strip()]
+    if len(parts) < 2:  # else it is a stream of messages, as ROS prints them
+        return parse_yaml(plain, str(path))
+    return [parse_yaml(part, str(path)) for part in parts]
+
+
+def _decoded(path: Path) -> str:
+    """Return the text of a file in UTF-8, or in what spreadsheets write."""
+    try:
+        head = path.read_bytes()[:4]
+        if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+            return path.read_text("utf-16")
+        return read_text(path).removeprefix("\ufeff")
+    except (OSError, UnicodeError) as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"can't read {path}: {type(error).__name__}") from error
 
 
 def _arrays(path: Path) -> dict[str, Any]:
@@ -77,7 +98,11 @@ def _arrays(path: Path) -> dict[str, Any]:
         raise OpenArmError(
             Code.CONFIG_INVALID, f"{path} holds no arrays of numbers that can be read: {type(error).__name__}"
         ) from error
-    return {name: value for name, value in read.items() if value is not None}
+    # names that NumPy gives count the arrays, not records
+    plain = {
+        name: re.sub(r"^arr_(\d+)$", lambda found: f"array {'abcdefghij'[int(found[1]) % 10]}", name) for name in read
+    }
+    return {plain[name]: value for name, value in read.items() if value is not None}
 
 
 def _array(data: bytes) -> Any:
@@ -118,15 +143,27 @@ def _storage_xml(text: str, where: str) -> Any:
     return value(root)
 
 
+#: What stands for no number in a table, and units behind one.
+_NONE = ("", "nan", "none", "null", "-", "n/a", "na", "inf")
+_WITH_UNIT = re.compile(r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?:mm|cm|m|deg|rad|°)")
+
+
 def number(text: Any) -> float | None:
     """Return a finite number, or None."""
     if isinstance(text, bool):
         return None
+    if isinstance(text, str) and (found := _WITH_UNIT.fullmatch(text)):
+        text = found[1]
     try:
         value = float(text)
     except (TypeError, ValueError, OverflowError):
         return None
     return value if math.isfinite(value) else None
+
+
+def is_missing(cell: str) -> bool:
+    """Return whether a cell stands for a number that is not there."""
+    return cell.lower() in _NONE
 
 
 def read_cells(path: Path) -> Cells:
@@ -135,26 +172,47 @@ def read_cells(path: Path) -> Cells:
     Raises:
         OpenArmError: CONFIG_INVALID.
     """
-    text = read_text(path)
-    numbered = [(k + 1, line.strip()) for k, line in enumerate(text.splitlines())]
-    said = [line.lstrip("#").strip() for _, line in numbered if line.startswith("#")]
-    numbered = [(k, line) for k, line in numbered if line and not line.startswith("#")]
-    split = next((mark for mark in (",", ";", "\t") if numbered and mark in numbered[-1][1]), None)
+    numbered = [(k + 1, line.strip()) for k, line in enumerate(_decoded(path).splitlines())]
+    said = [line.lstrip("#%/ ") for _, line in numbered if line.startswith(_COMMENT)]
+    numbered = [(k, line) for k, line in numbered if line and not line.startswith((*_COMMENT, "sep="))]
+    # brackets of lists, and of what robots print: p[x, y, ...], {X 1.0, Y 2.0, ...}
+    plain: list[tuple[int, str]] = []
+    for k, line in numbered:
+        bare = _BRACKETS.sub(" ", line)
+        plain.append((k, bare.strip(" ,;") if bare != line else line))
+    plain = [(k, line) for k, line in plain if line]
+    lines = [line for _, line in plain]
+    split = next((mark for mark in (";", "\t", ",") if len(lines) and all(mark in line for line in lines[-3:])), None)
 
     def cells(line: str) -> tuple[str, ...]:
         parts = next(csv.reader([line], delimiter=split)) if split else line.split()
-        return tuple(part.strip() for part in parts)
+        out = (part.strip() for part in parts)
+        return tuple(_DECIMAL.sub(r"\1.\2", part) for part in out) if split in (";", "\t") else tuple(out)
 
     try:
-        rows = [(k, cells(line)) for k, line in numbered]
-    except csv.Error as error:
+        rows = [(k, cells(line)) for k, line in plain]
+    except (csv.Error, StopIteration) as error:
         raise OpenArmError(Code.CONFIG_INVALID, f"{path} is no table: {error}") from error
-    # a comma at the end of each line, or between values and blanks, makes a cell of nothing
+    # a comma at the end of each line makes a cell of nothing; a first line of one number says how many there are
     if rows and all(not row[-1] for _, row in rows):
         rows = [(k, row[:-1]) for k, row in rows]
+    if len(rows) > 1 and len(rows[0][1]) == 1 < len(rows[1][1]):
+        rows = rows[1:]
     header: tuple[str, ...] = ()
-    if rows and sum(number(cell) is None for cell in rows[0][1]) > 1:
+    if rows and sum(number(cell) is None and not is_missing(cell) for cell in rows[0][1]) > 1:
         header, rows = rows[0][1], rows[1:]
     elif said and rows and len(cells(said[-1])) == len(rows[0][1]):  # TUM's, and NumPy's
         header = cells(said[-1])
-    return Cells(header, tuple(row for _, row in rows), tuple(k for k, _ in rows))
+    return _in_blocks(Cells(header, tuple(row for _, row in rows), tuple(k for k, _ in rows)))
+
+
+def _in_blocks(table: Cells) -> Cells:
+    """Return a table of 4x4 matrices, a row a line, with a matrix a line."""
+    rows = table.rows
+    last = ("0", "0", "0", "1")
+    if not rows or len(rows) % 4 or {len(row) for row in rows} != {4}:
+        return table
+    if any(tuple(f"{value:g}" for cell in row if (value := number(cell)) is not None) != last for row in rows[3::4]):
+        return table
+    whole = tuple(sum(rows[k : k + 4], ()) for k in range(0, len(rows), 4))
+    return Cells((), whole, table.lines[::4])

@@ -330,7 +330,7 @@ def _to_type(best: Tried, setups: Sequence[Setup], robot: Poses, board: Poses) -
     if best.setup not in setups:
         ways = [one.frames if one.inverse else inverted(one.frames) for one in (best.robot, best.board)]
         words.append(
-            f"--camera-kind {KIND[best.setup]}; where it is {KIND[setups[0]]} indeed, the poses of one are the other"
-            f" way round: --frames {ways[0]} or --board-frames {ways[1]}"
+            f"--frames {ways[0]} or --board-frames {ways[1]}, whichever are the other way round; if it is"
+            f" {KIND[best.setup]} indeed, --camera-kind {KIND[best.setup]}"
         )
     return f"give {', '.join(words)}"

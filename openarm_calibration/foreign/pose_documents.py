@@ -25,11 +25,12 @@ _INVERSE = {
 }  # fmt: skip
 _PLACE = ("translation", "position", "trans", "pos", "tvec", "t", "xyz", "p", "location")
 _TURN = ("rotation", "orientation", "quaternion", "quat", "q", "rot", "rvec", "rotvec", "r", "rpy", "euler")
-#: Names of lists of rotations and of translations, before what they are of.
-_TURNS = re.compile(r"(?:rvecs?|rot(?:ations?)?|r)((?:_.*)?)")
-_SHIFTS = re.compile(r"(?:tvecs?|trans(?:lations?)?|t|pos(?:itions?)?)((?:_.*)?)")
+#: Parts of names of rotations and of translations that are written apart.
+_TURNS = ("rvec", "rvecs", "rot", "rotation", "rotations", "r")
+_SHIFTS = ("tvec", "tvecs", "trans", "translation", "translations", "t", "pos", "position", "positions")
 #: Of mappings and lists on the way to a pose.
 _Keys = tuple[str | int, ...]
+_PART = re.compile("|".join((*_PLACE, *_TURN, "[xyzabcw]", "[qr][xyzw]", "roll", "pitch", "yaw")))
 _LETTERS = ("x", "y", "z", "w")
 
 
@@ -43,6 +44,8 @@ class Column:
         labels: (n,) of the records.
         rotation: Form that the file tells; "" where it does not.
         unit: The same of positions.
+        keys: (n,) what tells which records of two columns belong together; () where nothing does.
+        stamps: (n,) times, s or ns; () where there are none.
     """
 
     name: str
@@ -50,6 +53,8 @@ class Column:
     labels: tuple[str, ...]
     rotation: str = ""
     unit: str = ""
+    keys: tuple[str, ...] = ()
+    stamps: tuple[float, ...] = ()
 
     @property
     def corners(self) -> bool:
@@ -58,8 +63,9 @@ class Column:
 
     def subset(self, chosen: list[int]) -> Column:
         """Return some of the records."""
+        keys, stamps = (tuple(each[k] for k in chosen) if each else () for each in (self.keys, self.stamps))
         labels = tuple(self.labels[k] for k in chosen)
-        return replace(self, rows=self.rows[chosen], labels=labels)
+        return replace(self, rows=self.rows[chosen], labels=labels, keys=keys, stamps=stamps)
 
     def inverse(self, whose: str) -> bool:
         """Whether its name says that the poses are the other way round; `whose` is robot or board."""
@@ -76,7 +82,9 @@ def searched(path: Path, document: Any) -> list[Column]:
     for (name, _), entries in found.items():
         forms = {form for _, _, form in entries}
         rows = np.array([value for _, value, _ in entries])
-        out.append(Column(name, rows, tuple(label for label, _, _ in entries), forms.pop() if len(forms) == 1 else ""))
+        labels = tuple(label for label, _, _ in entries)
+        keys = tuple((re.findall(r"\d+", label) or [label])[-1] for label in labels)
+        out.append(Column(name, rows, labels, forms.pop() if len(forms) == 1 else "", keys=keys))
     most = max((len(one.rows) for one in out), default=0)
     if most > MOST:
         raise OpenArmError(Code.CONFIG_INVALID, f"{path} has {most} poses, expected at most {MOST}")
@@ -117,10 +125,15 @@ def _poses(value: Any, keys: _Keys) -> Iterator[tuple[_Keys, Array, str]]:
         if matrix is not None:
             yield from _poses(matrix, keys)
             return
+        entries = {key: one for key, one in entries.items() if "joint" not in key.lower()}
         pose = _of_parts(entries)
         if pose is not None:
-            yield keys, *pose
-            return
+            # what stands beside it may be another one
+            entries = {key: one for key, one in entries.items() if not _PART.fullmatch(key.lower().lstrip("_"))}
+            others = any(True for _ in _poses(entries, keys))
+            yield (*keys, "rvec tvec") if others else keys, *pose
+            if not others:
+                return
         yield from _of_pairs(entries, keys)
         for key, one in entries.items():
             yield from _poses(one, (*keys, key))
@@ -232,14 +245,14 @@ def _of_pairs(entries: Mapping[str, Any], keys: _Keys) -> Iterator[tuple[_Keys, 
     Such as `R_gripper2base` and `t_gripper2base` of OpenCV's calibrateHandEye.
     """
     arrays = {key: array for key, one in entries.items() if (array := _numbers(_plain(one))) is not None}
-    shifts = {stem[1]: key for key in arrays if (stem := _SHIFTS.fullmatch(key.lower())) is not None}
+    shifts = {stem: key for key in arrays if (stem := _without(key, _SHIFTS)) is not None}
     for key, turns in arrays.items():
-        stem = _TURNS.fullmatch(key.lower())
-        other = shifts.get(stem[1]) if stem is not None else None
+        stem = _without(key, _TURNS)
+        other = shifts.get(stem) if stem is not None else None
         if stem is None or other is None:
             continue
         places = arrays[other].reshape(-1, 3) if arrays[other].size % 3 == 0 else np.empty((0, 3))
-        n, name = len(places), stem[1].lstrip("_") or "poses"
+        n, name = len(places), stem or "poses"
         if n == 0 or turns.size not in (3 * n, 9 * n):
             continue
         form = "matrix" if turns.size == 9 * n else "rotvec" if key.lower().startswith("rvec") else ""
@@ -248,6 +261,13 @@ def _of_pairs(entries: Mapping[str, Any], keys: _Keys) -> Iterator[tuple[_Keys, 
                 np.hstack([turn.reshape(3, 3), place[:, None]]).ravel() if form == "matrix" else np.append(place, turn)
             )
             yield (*keys, name, k) if n > 1 else (*keys, name), row, form
+
+
+def _without(name: str, words: tuple[str, ...]) -> str | None:
+    """Return a name without the first of its parts that is among some words; None where none is."""
+    parts = name.lower().split("_")
+    k = next((k for k, part in enumerate(parts) if part in words), None)
+    return None if k is None else "_".join((*parts[:k], *parts[k + 1 :]))
 
 
 def _plain(value: Any) -> Any:

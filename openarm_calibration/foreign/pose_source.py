@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from openarm_calibration.foreign.documents import DOCUMENTS, TABLES, number, read_cells, read_document
 from openarm_calibration.foreign.pose_documents import MOST, Column, searched
@@ -21,6 +23,7 @@ from openarm_calibration.foreign.pose_tables import of_table
 from openarm_calibration.handeye.problem import Setup
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
+from openarm_common.types import Array
 
 #: Kinds of cameras by the names that are in use for them.
 KINDS: dict[str, Setup] = {"eye_in_hand": "in_hand", "eye_on_hand": "in_hand", "eye_to_hand": "to_hand",
@@ -28,9 +31,9 @@ KINDS: dict[str, Setup] = {"eye_in_hand": "in_hand", "eye_on_hand": "in_hand", "
 #: Name of the robot's poses in a file of easy_handeye2, which has those for a fixed camera the other way round.
 EASY_HANDEYE2 = "samples.robot"
 _ROBOT = ("robot", "gripper", "hand", "effector", "eef", "ee", "tcp", "tool", "tool0", "flange", "tip", "arm", "end",
-          "wrist", "fk", "a")  # fmt: skip
+          "wrist", "fk")  # fmt: skip
 _BOARD = ("board", "target", "tracking", "optical", "marker", "object", "obj", "camera", "cam", "eye", "pattern",
-          "chessboard", "checkerboard", "charuco", "tag", "sensor", "color", "rgb", "c", "b")  # fmt: skip
+          "chessboard", "checkerboard", "charuco", "tag", "sensor", "color", "rgb", "tvec", "rvec")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,28 +73,29 @@ def kind_of(name: str, what: str) -> Setup:
     return KINDS[name]
 
 
-def read_source(path: Path, other: Path | None = None, columns: str = "") -> Source:
+def read_source(path: Path, other: Path | None = None, columns: str = "", roles: str = "") -> Source:
     """Read poses, and what else a file holds.
 
     Args:
         path: File, or folder with a file for each pose.
         other: A second one, of the board, where the poses are in two.
-        columns: Names of the columns of a table, such as `image x y z qx qy qz qw`.
+        columns: Names of the columns of a table, such as `image x y z qx qy qz qw`; those of the second behind a `;`.
+        roles: Names of the robot's poses and of the board's in the file, such as `A,B`; "": told by their names.
 
     Raises:
         OpenArmError: CONFIG_INVALID, naming what is wrong, and what is read.
     """
-    names = tuple(columns.replace(",", " ").split())
-    found, images, document = _columns_of(path, names)
+    first, _, behind = columns.partition(";")
+    found, images, document = _columns_of(path, tuple(first.replace(",", " ").split()))
     if other is not None:
-        more, _, _ = _columns_of(other, names)
+        more, _, _ = _columns_of(other, tuple(behind.replace(",", " ").split()))
         if len(found) != 1 or len(more) != 1:
             raise OpenArmError(
                 Code.CONFIG_INVALID,
                 f"{path} has the poses {_listed(found)} and {other} {_listed(more)}; expected one column in each",
             )
         found = [_named(found[0], "robot"), _named(more[0], "board")]
-    robot, second = _told_apart(path, found)
+    robot, second = _named_by(path, found, roles) if roles else _told_apart(path, found)
     left_out: tuple[str, ...] = ()
     if second is not None:
         robot, second, left_out = _aligned(path, robot, second)
@@ -113,7 +117,7 @@ def read_source(path: Path, other: Path | None = None, columns: str = "") -> Sou
 
 
 def _named(column: Column, name: str) -> Column:
-    return Column(f"{name} {column.name}", column.rows, column.labels, column.rotation, column.unit)
+    return replace(column, name=f"{name} {column.name}")
 
 
 def _columns_of(path: Path, names: tuple[str, ...]) -> tuple[list[Column], tuple[str, ...], Any]:
@@ -166,16 +170,25 @@ def _told_apart(path: Path, found: list[Column]) -> tuple[Column, Column | None]
     boards = [one for one in poses if _score(one, _BOARD) > _score(one, _ROBOT)]
     if len(robots) == 1 and len(boards) == 1:
         return robots[0], boards[0]
-    if len(poses) == 2 and len(robots) < 2 and len(boards) < 2:
-        first = robots[0] if robots else next(one for one in poses if one not in boards)
-        return first, next(one for one in poses if one is not first)
+    if len(poses) == 2 and all(re.fullmatch(r"(.*\.)?(\d|poses)", one.name) for one in poses):
+        return poses[0], poses[1]  # pairs in a list: the robot's comes first
     if len(poses) == 1 or (len(robots) == 1 and corners):
         return (poses if len(poses) == 1 else robots)[0], max(corners, key=lambda one: len(one.rows), default=None)
     raise OpenArmError(
         Code.CONFIG_INVALID,
         f"{path} has the poses {_listed(poses)}; expected one column of the robot and one of the board, by names such"
-        " as robot, hand, gripper2base and board, eye, target2cam; rename them, or give two files: FILE --with FILE",
+        " as robot, hand, gripper2base and board, eye, target2cam: which is which changes the answer; say it by --roles"
+        " ROBOT,BOARD",
     )
+
+
+def _named_by(path: Path, found: list[Column], roles: str) -> tuple[Column, Column]:
+    """Return the columns that two names stand for: those of the robot and of the board."""
+    names = [name.strip() for name in roles.split(",")]
+    columns = [next((one for one in found if name in (one.name, one.name.rpartition(".")[2])), None) for name in names]
+    if len(columns) != 2 or columns[0] is None or columns[1] is None:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--roles {roles}: expected two names of {path}: {_listed(found)}")
+    return columns[0], columns[1]
 
 
 def _score(column: Column, words: tuple[str, ...]) -> int:
@@ -187,21 +200,35 @@ def _score(column: Column, words: tuple[str, ...]) -> int:
 def _aligned(path: Path, one: Column, other: Column) -> tuple[Column, Column, tuple[str, ...]]:
     """Return two columns whose rows belong together, and the records that only one of them has.
 
-    Records are matched by their numbers, where both have such, and by their order otherwise.
+    Records are matched by their numbers or names, by their times, or by their order, in this order of preference.
     """
-    keys, others = ([(re.findall(r"\d+", label) or [label])[-1] for label in each.labels] for each in (one, other))
+    keys, others = list(one.keys), list(other.keys)
     shared = {*keys} & {*others}
-    told = len({*keys}) == len(keys) and len({*others}) == len(others) and 2 * len(shared) > min(len(keys), len(others))
-    if told and keys != others:
+    if len({*keys}) == len(keys) and len({*others}) == len(others) and 2 * len(shared) > min(len(keys), len(others)):
         mine = [k for k, key in enumerate(keys) if key in shared]
         theirs = [others.index(keys[k]) for k in mine]
-        alone = [label for each, known in ((one, keys), (other, others))
-                 for label, key in zip(each.labels, known, strict=True) if key not in shared]  # fmt: skip
-        return one.subset(mine), other.subset(theirs), tuple(alone)
-    if len(keys) != len(others):
+    elif one.stamps and other.stamps:
+        mine, theirs = _at_once(np.array(one.stamps), np.array(other.stamps))
+    elif len(one.rows) == len(other.rows):
+        return one, other, ()
+    else:
         raise OpenArmError(
             Code.CONFIG_INVALID,
-            f"{path} has {_listed([one, other])}: not as many of either, and no numbers of records tell which belong"
-            " together",
+            f"{path} has {_listed([one, other])}: not as many of either, and neither numbers of records nor times tell"
+            " which belong together",
         )
-    return one, other, ()
+    fewer, used = (one, mine) if len(one.rows) <= len(other.rows) else (other, theirs)
+    alone = [label for k, label in enumerate(fewer.labels) if k not in used]
+    if not one.stamps or keys:  # else one of the two was recorded more often
+        more, known = (other, theirs) if fewer is one else (one, mine)
+        alone += [label for k, label in enumerate(more.labels) if k not in known]
+    return one.subset(mine), other.subset(theirs), tuple(alone)
+
+
+def _at_once(first: Array, second: Array) -> tuple[list[int], list[int]]:
+    """Return which of two lists of times are the nearest to each other, and nearer than others are to either."""
+    apart = np.abs(first[:, None] - second)
+    nearest, back = apart.argmin(axis=1), apart.argmin(axis=0)
+    step = min((float(np.median(np.diff(np.sort(t)))) for t in (first, second) if len(t) > 1), default=np.inf)
+    mine = [k for k, j in enumerate(nearest) if back[j] == k and apart[k, j] <= 0.5 * step]
+    return mine, [int(nearest[k]) for k in mine]

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from openarm_calibration.foreign.documents import Cells, number
+from openarm_calibration.foreign.documents import Cells, is_missing, number
 from openarm_calibration.foreign.pose_documents import MOST, Column
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
@@ -29,35 +30,50 @@ def of_table(path: Path, cells: Cells, names: tuple[str, ...]) -> tuple[list[Col
             )
     values = [[number(cell) for cell in row] for row in cells.rows]
     words = [k for k in range(wide) if all(row[k] is None for row in values)]
-    torn = next(
-        (
-            (line, row[k])
-            for k in range(wide)
-            for line, row, value in zip(cells.lines, cells.rows, values, strict=True)
-            if k not in words and value[k] is None
-        ),
-        None,
-    )
-    if torn is not None:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{path}:{torn[0]}: {brief(torn[1])} is no finite number")
     if len(words) == wide:
         raise OpenArmError(Code.CONFIG_INVALID, f"{path} has no poses: expected a line of numbers for each")
-    numbers = np.array([[row[k] for k in range(wide) if k not in words] for row in values], dtype=np.float64)
-    labels = tuple(f"line {line}" for line in cells.lines)
+    kept: list[int] = []
+    for k, (line, row, value) in enumerate(zip(cells.lines, cells.rows, values, strict=True)):
+        torn = [cell for j, cell in enumerate(row) if j not in words and value[j] is None]
+        if wrong := [cell for cell in torn if not is_missing(cell)]:
+            raise OpenArmError(Code.CONFIG_INVALID, f"{path}:{line}: {brief(wrong[0])} is no finite number")
+        if not torn:  # where the board was not found there is nothing
+            kept.append(k)
+    if not kept:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{path} has no line whose numbers are all there")
+    numbers = np.array([[values[k][j] for j in range(wide) if j not in words] for k in kept], dtype=np.float64)
+    labels = tuple(f"line {cells.lines[k]}" for k in kept)
     header = names or cells.header
     if names and len(names) != wide:
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             f"--columns names {len(names)} columns, {path} has {wide}; write - for one to leave out",
         )
-    who = [tuple(row[k] for row in cells.rows) for k in words]
+    who = [tuple(cells.rows[k][j] for k in kept) for j in words]
     for label in who:
         kinds = sorted(set(label), key=label.index)
         if len(kinds) == 2 and all(label.count(kind) == len(label) // 2 for kind in kinds):
             return _by_label(header, numbers, label, labels, words), ()
     header = tuple(name for k, name in enumerate(header) if k not in words) if len(header) == wide else ()
     images = who[0] if who else ()
-    return _split(path, header, numbers, labels), images
+    keys, stamps = _told_by(header, numbers)
+    columns = _split(path, header, numbers, labels)
+    return [replace(one, keys=images or keys, stamps=stamps) for one in columns], images
+
+
+def _told_by(header: tuple[str, ...], numbers: Array) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Return what tells which lines of two tables belong together: numbers of records, or times."""
+    keys: tuple[str, ...] = ()
+    stamps: tuple[float, ...] = ()
+    for name, values in zip(header, numbers.T, strict=False):
+        word = re.sub(r"[^a-z]", "", name.lower())
+        if word in ("id", "index", "idx", "frame", "frameid", "record", "sample", "pose", "image", "no", "number"):
+            keys = tuple(f"{value:g}" for value in values)
+        elif word in ("timestamp", "time", "stamp", "t", "sec", "ts", "timestampns", "timens"):
+            stamps = tuple(values.tolist())
+    if not header and numbers.shape[1] in (8, 15) and (np.diff(numbers[:, 0]) > 0.0).all():
+        stamps = tuple(numbers[:, 0].tolist())
+    return keys, stamps
 
 
 def _by_label(
@@ -130,8 +146,9 @@ def _by_header(header: tuple[str, ...], numbers: Array, labels: tuple[str, ...])
             if set(wanted) <= parts.keys():
                 units = {parts[name][1] for name in wanted}
                 unit = next((one for one in ("mm", "cm", "m") if one in units), "")
-                turned = "_deg" if "deg" in units and form not in ("xyzw", "matrix") else ""
-                rotation = f"{form}{turned}" if form else ""
+                turned = next((one for one in ("deg", "rad") if one in units), "")
+                # of angles the unit is found where it is not said
+                rotation = {"": "", "deg": "rpy_deg", "rad": "rpy"}[turned] if form == "rpy" else form
                 out.append(
                     Column(prefix or "poses", numbers[:, [parts[name][0] for name in wanted]], labels, rotation, unit)
                 )

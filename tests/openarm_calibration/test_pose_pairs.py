@@ -179,7 +179,10 @@ def test_each_convention_is_found_from_the_numbers_alone(rotation) -> None:
 @pytest.mark.parametrize(
     ("stated", "words"),
     [
-        ({"setup": "to_hand"}, r"as eye_in_hand; .* give --camera-kind eye_in_hand; where it is eye_to_hand indeed"),
+        (
+            {"setup": "to_hand"},
+            r"as eye_in_hand; .* give --frames T_tip_base or --board-frames .*, --camera-kind eye_in_hand",
+        ),
         ({"inverse": True}, r"as eye_to_hand; .*--frames T_tip_base or --board-frames T_board_camera"),
         ({"board_inverse": True}, "--board-frames T_board_camera"),
         ({"rotation": "wxyz"}, r"as stated .* remain; .* give --rotation xyzw \(quaternion x y z w\)"),

@@ -180,6 +180,76 @@ def test_records_belong_together_by_their_numbers_and_half_of_one_is_left_out(tm
     assert (poses(source.robot) == pytest.approx(A), poses(source.board) == pytest.approx(C)) == (True, True)
 
 
+def semicolons(T: np.ndarray) -> str:
+    """As a spreadsheet of a country with decimal commas writes it."""
+    lines = [";".join(f"{v:.9f}".replace(".", ",") for v in row) for row in files.numbers(T, "xyzw")]
+    return "sep=;\nx;y;z;qx;qy;qz;qw\n" + "\n".join(lines)
+
+
+def blocks(T: np.ndarray) -> str:
+    return "\n\n".join("\n".join(" ".join(map(repr, row)) for row in one) for one in T.tolist())
+
+
+def of_a_robot(T: np.ndarray) -> str:
+    return "".join(f"p[{', '.join(map(repr, row))}]\n" for row in files.numbers(T, "rotvec").tolist())
+
+
+def echoed(T: np.ndarray) -> str:
+    """As `ros2 topic echo` prints messages."""
+    out = ""
+    for x, y, z, *q in files.numbers(T, "xyzw").tolist():
+        turn = "".join(f"    {name}: {v}\n" for name, v in zip("xyzw", q, strict=True))
+        place = f"  position:\n    x: {x}\n    y: {y}\n    z: {z}\n"
+        out += f"header:\n  frame_id: base\npose:\n{place}  orientation:\n{turn}---\n"
+    return out
+
+
+@pytest.mark.parametrize(
+    ("write", "name", "form"),
+    [(semicolons, "a.csv", "xyzw"), (blocks, "b.txt", "matrix"), (of_a_robot, "c.txt", "rotvec"),
+     (echoed, "d.yaml", "xyzw"), (lambda T: "\n".join(json.dumps({"pose": one}) for one in T.tolist()), "e.jsonl", "matrix")],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_what_spreadsheets_robots_and_consoles_write_is_read(tmp_path: Path, write, name: str, form: str) -> None:
+    (tmp_path / name).write_text(write(A), "utf-16" if name == "a.csv" else "utf-8")
+    assert poses(read_source(tmp_path / name).robot, form) == pytest.approx(A, abs=1e-7)
+
+
+def test_lines_of_two_tables_belong_together_by_times_and_numbers_and_never_by_their_place(tmp_path: Path) -> None:
+    """One has a header, is recorded more often, or lacks a line; without times or numbers counts must be equal."""
+    rows = files.numbers(A, "xyzw"), files.numbers(C, "xyzw")
+    times = 10.0 + 0.5 * np.arange(8)[:, None]
+    often = np.vstack([np.hstack([times + step, rows[0] + 0.0 * step]) for step in (0.0, 0.1, 0.2)])
+    np.savetxt(
+        tmp_path / "a.csv", often[np.argsort(often[:, 0])], delimiter=",", header="t,x,y,z,qx,qy,qz,qw", comments=""
+    )
+    np.savetxt(tmp_path / "b.csv", np.delete(np.hstack([times + 0.003, rows[1]]), 2, axis=0), delimiter=",")
+    source = read_source(tmp_path / "a.csv", tmp_path / "b.csv")
+    whole = np.delete(np.arange(8), 2)
+    assert poses(source.robot, "xyzw") == pytest.approx(A[whole], abs=1e-8)
+    assert poses(source.board, "xyzw") == pytest.approx(C[whole], abs=1e-8)
+    np.savetxt(tmp_path / "c.csv", rows[0], delimiter=",", header="x,y,z,qx,qy,qz,qw", comments="")
+    np.savetxt(tmp_path / "d.csv", rows[1], delimiter=",")
+    source = read_source(tmp_path / "c.csv", tmp_path / "d.csv")
+    assert poses(source.robot, "xyzw") == pytest.approx(A, abs=1e-8)
+    assert poses(source.board, "xyzw") == pytest.approx(C, abs=1e-8)
+    np.savetxt(tmp_path / "d.csv", rows[1][:7], delimiter=",")
+    with refuses(Code.CONFIG_INVALID, "neither numbers of records nor times tell which belong together"):
+        read_source(tmp_path / "c.csv", tmp_path / "d.csv")
+
+
+def test_names_that_do_not_tell_whose_poses_they_are_are_refused_and_may_be_said(tmp_path: Path) -> None:
+    """A and B are the robot's and the board's in one book, and the other way round in the next."""
+    np.savez(tmp_path / "a.npz", A=C, B=A)
+    with refuses(Code.CONFIG_INVALID, r"'A' \(8\), 'B' \(8\).*--roles ROBOT,BOARD"):
+        read_source(tmp_path / "a.npz")
+    source = read_source(tmp_path / "a.npz", roles="B,A")
+    assert poses(source.robot) == pytest.approx(A)
+    assert poses(source.board) == pytest.approx(C)
+    with refuses(Code.INVALID_ARGUMENT, "--roles B,X: expected two names of"):
+        read_source(tmp_path / "a.npz", roles="B,X")
+
+
 def test_corners_without_pictures_come_with_the_poses(tmp_path: Path) -> None:
     corners = np.random.default_rng(0).uniform(0.0, 640.0, (8, 12, 2))
     records = [{"corners": pixels.tolist(), "T_base_hand": a.tolist()} for a, pixels in zip(A, corners, strict=True)]
@@ -220,7 +290,7 @@ def test_lists_of_corners_that_begin_at_either_end_are_read_alike(tmp_path: Path
         ("e.xml", "<!DOCTYPE a><a/>", "has a document type"),
         ("f.npz", "PK", "holds no arrays of numbers that can be read"),
         ("g.npy", "\x93NUMPY", "holds no arrays"),
-        ("h.json", json.dumps([[np.eye(4).tolist()] * 3] * 4), "has the poses .* give two files: FILE --with FILE"),
+        ("h.json", json.dumps([[np.eye(4).tolist()] * 3] * 4), "has the poses .* say it by --roles ROBOT,BOARD"),
     ],
 )
 @pytest.mark.requirement("A-45")
