@@ -206,10 +206,15 @@ def echoed(T: np.ndarray) -> str:
 
 @pytest.mark.parametrize(
     ("write", "name", "form"),
-    [(semicolons, "a.csv", "xyzw"), (blocks, "b.txt", "matrix"), (of_a_robot, "c.txt", "rotvec"),
-     (echoed, "d.yaml", "xyzw"), (lambda T: "\n".join(json.dumps({"pose": one}) for one in T.tolist()), "e.jsonl", "matrix")],
+    [
+        (semicolons, "a.csv", "xyzw"),
+        (blocks, "b.txt", "matrix"),
+        (of_a_robot, "c.txt", "rotvec"),
+        (echoed, "d.yaml", "xyzw"),
+        (lambda T: "\n".join(json.dumps({"pose": one}) for one in T.tolist()), "e.jsonl", "matrix"),
+    ],
     ids=lambda value: value if isinstance(value, str) else "",
-)  # fmt: skip
+)
 def test_what_spreadsheets_robots_and_consoles_write_is_read(tmp_path: Path, write, name: str, form: str) -> None:
     (tmp_path / name).write_text(write(A), "utf-16" if name == "a.csv" else "utf-8")
     assert poses(read_source(tmp_path / name).robot, form) == pytest.approx(A, abs=1e-7)
