@@ -201,7 +201,7 @@ def test_kernels_are_compiled_where_they_or_what_they_import_have_changed_and_ke
             assert answer.stdout.startswith("args: x\n"), answer.stderr
             assert machine.uv_calls().count("compile") == compiles, (text, limit, clone)
             assert (kernels.parent / "__pycache__" / "kernels.search-1.nbc").read_text() == kernels.read_text()
-            assert machine.run("x", root=clone).stderr == ""
+    assert machine.run("x", root=clones[1]).stderr == ""
 
 
 @pytest.mark.long
