@@ -119,6 +119,10 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
             self._channels.pop(topic)[0].close()
         for topic in topics.keys() - self._channels.keys() - self._unknown:
             self._advertise(topic, topics[topic])
+        for topic, subscription in list(self._forwarded.items()):
+            # a publisher may have come since, and what it has latched comes with a subscription of its kind only
+            if subscription.qos_profile != offered_qos(self, topic, 20):
+                self.destroy_subscription(self._forwarded.pop(topic))
         services = {name: kinds[0] for name, kinds in self.get_service_names_and_types() if "/_action/" not in name}
         gone = self._offered - services.keys()
         if gone:
