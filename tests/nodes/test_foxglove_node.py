@@ -125,12 +125,15 @@ def test_a_topic_is_advertised_with_its_definition_and_its_messages_come_byte_fo
 
 def test_a_latched_message_comes_where_its_publisher_does_after_the_client(ros, foxglove: Foxglove) -> None:
     """Until then the topic is known by a subscription only, and what will be offered is not."""
+    import rclpy
     from rclpy.serialization import serialize_message
     from std_msgs.msg import String
 
     from openarm_common.ros.node import QOS_LATCHED
 
     ros.hear(String, "/later")
+    elsewhere = rclpy.Context()
+    rclpy.init(context=elsewhere)
 
     async def look(session: aiohttp.ClientSession) -> bytes:
         async with session.ws_connect(foxglove.address(), protocols=[PROTOCOL], max_msg_size=0) as socket:
@@ -139,11 +142,15 @@ def test_a_latched_message_comes_where_its_publisher_does_after_the_client(ros, 
             )
             while "/later" not in foxglove.node._forwarded:
                 await asyncio.sleep(0.02)
-            # before anyone has found the publisher
-            ros.node.create_publisher(String, "/later", QOS_LATCHED).publish(String(data="here"))
+            # before anyone has found the publisher, which is another participant's
+            node = rclpy.create_node("later", context=elsewhere)
+            node.create_publisher(String, "/later", QOS_LATCHED).publish(String(data="here"))
             return await asked
 
-    assert foxglove.run(look) == serialize_message(String(data="here"))
+    try:
+        assert foxglove.run(look) == serialize_message(String(data="here"))
+    finally:
+        rclpy.shutdown(context=elsewhere)
 
 
 def test_a_service_is_called_from_foxglove(ros, foxglove: Foxglove) -> None:
