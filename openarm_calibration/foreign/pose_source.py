@@ -31,7 +31,7 @@ KINDS: dict[str, Setup] = {"eye_in_hand": "in_hand", "eye_on_hand": "in_hand", "
 #: Name of the robot's poses in a file of easy_handeye2, which has those for a fixed camera the other way round.
 EASY_HANDEYE2 = "samples.robot"
 _ROBOT = ("robot", "gripper", "hand", "effector", "eef", "ee", "tcp", "tool", "tool0", "flange", "tip", "arm", "end",
-          "wrist", "fk")  # fmt: skip
+          "fk")  # fmt: skip
 _BOARD = ("board", "target", "tracking", "optical", "marker", "object", "obj", "camera", "cam", "eye", "pattern",
           "chessboard", "checkerboard", "charuco", "tag", "sensor", "color", "rgb", "tvec", "rvec")  # fmt: skip
 

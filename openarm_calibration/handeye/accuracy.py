@@ -10,20 +10,25 @@ its evidence; so robots whose zeros are right are sure of their mounts. m, rad.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from openarm_calibration.handeye.kinematics import Kinematics
 from openarm_calibration.handeye.problem import Setup, layout
+from openarm_calibration.handeye.refine import refine
 from openarm_calibration.handeye.transforms import difference, moved
-from openarm_calibration.handeye.zero_sets import arm_views
-from openarm_calibration.handeye.zeros import weighed_answers
+from openarm_calibration.handeye.unknowns import Estimate, Priors, Solution
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 
+#: Deviations that zeros may have, rad; up to the usual one they are taken for equally likely, larger ones for less.
+_SCALES: Array = np.radians([0.001, 0.03, 0.06, 0.1, 0.2, 0.4, 1.0, 2.0, 4.0])
+_USUAL = math.radians(1.0)
+#: Answers that are less probable are not looked at.
+_UNLIKELY = 1e-3
 #: Most postures at which the hand is looked at.
 _POSTURES = 12
 #: Steps of derivatives, m and rad.
@@ -47,33 +52,41 @@ class Accuracy:
     zeros: float
 
 
-def accuracy_of(samples: SampleSet, X: Array) -> Accuracy:
+def accuracy_of(samples: SampleSet, solution: Solution) -> Accuracy:
     """Return how wrong a mount may be.
 
     Args:
         samples: Samples of one camera, on a robot whose joints are known.
-        X: (4, 4) its mount, by the joints as they are reported.
-
-    Raises:
-        OpenArmError: DEGENERATE, when the samples determine no mount.
+        solution: Mount by the joints as they are reported.
     """
-    views, optics = arm_views([samples])
-    answers = weighed_answers(samples.description, views, optics)
+    part, now = solution.problem.subset(solution.used), solution.estimate
+    X, noise, zeros = now.X[0], replace(now.noise, misfit=0.0), np.zeros(part.joints)
+    answers: list[Estimate] = []
+    for scale in _SCALES:
+        before = answers[-1] if answers else now
+        answers.append(
+            refine(
+                part, before.X, before.Z, noise, zeros=zeros, extras=("zeros",),
+                priors=Priors(zeros=np.full(part.joints, scale)), estimate_robot=True, estimate_px=True,
+                estimate_misfit=False,
+            )
+        )  # fmt: skip
+        noise, zeros = answers[-1].noise, answers[-1].zeros
+    evidence = np.array([answer.evidence for answer in answers])
+    weights = np.exp(-0.5 * (evidence - evidence.min())) / (1.0 + (_SCALES / _USUAL) ** 2)
     hand = _Hand.of(samples, X)
-    mount, miss, zeros = np.zeros((6, 6)), 0.0, 0.0
-    for weight, sigma, solution in answers:
-        estimate = solution.estimate
-        covariance = estimate.covariance()
-        columns = layout(solution.problem, estimate.extras)["zeros"]
+    mount, miss = np.zeros((6, 6)), 0.0
+    for weight, answer in zip(weights / weights.sum(), answers, strict=True):
+        if weight < _UNLIKELY:
+            continue
+        covariance = answer.covariance()
+        columns = layout(part, answer.extras)["zeros"]
         both = np.r_[0:6, np.arange(columns.start, columns.stop)]
-        away = difference(X, estimate.X[0])
+        away = difference(X, answer.X[0])
         mount += weight * (covariance[:6, :6] + np.outer(away, away))
-        miss += weight * hand.square(estimate.X[0], estimate.zeros, covariance[np.ix_(both, both)])
-        zeros += weight * float(np.mean(sigma**2))
-    variance = np.diag(mount)
-    return Accuracy(
-        math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum()), math.sqrt(miss), math.sqrt(zeros)
-    )  # fmt: skip
+        miss += weight * hand.square(answer.X[0], answer.zeros, covariance[np.ix_(both, both)])
+    variance, off = np.diag(mount), math.sqrt(float(weights @ _SCALES**2 / weights.sum()))
+    return Accuracy(math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum()), math.sqrt(miss), off)
 
 
 @dataclass(frozen=True, eq=False)

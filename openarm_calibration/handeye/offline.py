@@ -123,7 +123,7 @@ def judged(
     X = solution.estimate.X[0]
     figures = verdict.figures
     if problem.joints:
-        by_zeros = accuracy_of(samples, X)
+        by_zeros = accuracy_of(samples, solution)
         for name, value in (("translation", by_zeros.translation), ("rotation", by_zeros.rotation)):
             figures[f"accuracy_{name}"] = math.hypot(figures[f"accuracy_{name}"], value)
         figures.update(hand=by_zeros.hand, zeros_sigma=by_zeros.zeros)

@@ -37,10 +37,6 @@ _SCALES = tuple(math.radians(degrees) for degrees in (0.001, 0.03, 0.1, 0.25, 0.
 #: Twice the logarithm of the likelihood ratio from which the zeros count as wrong: very strong evidence (Kass and
 #: Raftery 1995, "Bayes factors").
 _EVIDENT = 10.0
-#: A zero is set to this or better, rad.
-_USUAL = math.radians(1.0)
-#: Answers that are less probable are not looked at.
-_UNLIKELY = 1e-3
 #: Posterior over prior deviation up to which the data tell a joint; two joints that only differ by a mount have 0.71.
 _TOLD = 0.5
 
@@ -201,48 +197,6 @@ def arm_problem(
     return assemble(armed, intrinsics, [view.guess for view in views])
 
 
-def _solver(config: ZerosConfig) -> SolveConfig:
-    return config.solver.model_copy(update={"extras": (*config.solver.extras, "zeros")})
-
-
-def _answers(
-    description: RobotDescription, views: Sequence[ArmView], intrinsics: Sequence[Intrinsics], config: ZerosConfig,
-    start: Solution | None = None,
-) -> tuple[tuple[str, ...], list[tuple[Array, Solution]]]:  # fmt: skip
-    """Return the names of the parameters, and an answer for each deviation of the offsets, with theirs (parameters,).
-
-    The first says that zeros are right. Arguments and errors as of `solve_zeros`.
-    """
-    if not views:
-        raise OpenArmError(Code.INVALID_ARGUMENT, "no views; take samples of at least one camera and board")
-    names, _ = _parameters(description, views, config)
-    problem = arm_problem(description, views, intrinsics, names).posed(np.zeros(len(names)))
-    # views that contradict the others may do so by the zeros alone, as long as these are not known
-    trusting = _solver(config).model_copy(update={"reject_outliers": False})
-    answers: list[tuple[Array, Solution]] = []
-    given = () if config.sigma is None else (config.sigma,)
-    for scale in _SCALES if not given else given if start is not None else (_SCALES[0], *given):
-        _, sigma = _parameters(description, views, config.model_copy(update={"sigma": scale}))
-        start = solve(problem, trusting, Priors(zeros=sigma), start=start)
-        answers.append((sigma, start))
-    return names, answers
-
-
-def weighed_answers(
-    description: RobotDescription, views: Sequence[ArmView], intrinsics: Sequence[Intrinsics]
-) -> list[tuple[float, Array, Solution]]:
-    """Return answers for several deviations of the offsets, each with its probability and the deviations (parameters,).
-
-    Before anything is seen deviations up to 1° are taken for equally likely, larger ones for less by their square.
-    Arguments and errors as of `solve_zeros`.
-    """
-    _, answers = _answers(description, views, intrinsics, ZerosConfig())
-    evidence = np.array([solution.estimate.evidence for _, solution in answers])
-    weights = np.exp(-0.5 * (evidence - evidence.min())) / (1.0 + (np.array(_SCALES) / _USUAL) ** 2)
-    weights /= weights.sum()
-    return [(float(w), *answer) for w, answer in zip(weights, answers, strict=True) if w > _UNLIKELY]
-
-
 def solve_zeros(
     description: RobotDescription,
     views: Sequence[ArmView],
@@ -264,9 +218,19 @@ def solve_zeros(
             joint that moves nothing.
     """
     config = config or ZerosConfig()
-    names, answers = _answers(description, views, intrinsics, config, start)
-    given = config.sigma is not None
-    solver, problem = _solver(config), answers[0][1].problem
+    if not views:
+        raise OpenArmError(Code.INVALID_ARGUMENT, "no views; take samples of at least one camera and board")
+    names, _ = _parameters(description, views, config)
+    problem = arm_problem(description, views, intrinsics, names).posed(np.zeros(len(names)))
+    solver = config.solver.model_copy(update={"extras": (*config.solver.extras, "zeros")})
+    # views that contradict the others may do so by the zeros alone, as long as these are not known
+    trusting = solver.model_copy(update={"reject_outliers": False})
+    answers: list[tuple[Array, Solution]] = []
+    given = () if config.sigma is None else (config.sigma,)
+    for scale in _SCALES if not given else given if start is not None else (_SCALES[0], *given):
+        _, sigma = _parameters(description, views, config.model_copy(update={"sigma": scale}))
+        start = solve(problem, trusting, Priors(zeros=sigma), start=start)
+        answers.append((sigma, start))
     prior, solution = answers[-1] if given else min(answers, key=lambda answer: answer[1].estimate.evidence)
     if not given and not solution.estimate.evidence < answers[0][1].estimate.evidence - _EVIDENT:
         prior, solution = answers[0]

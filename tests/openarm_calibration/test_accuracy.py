@@ -46,8 +46,9 @@ def test_predicted_errors_are_those_of_repetitions(setup, rms: float) -> None:
     for seed in range(4):
         offsets = dict(zip(names, np.random.default_rng(seed).normal(0.0, math.radians(rms), 7).tolist(), strict=True))
         known = make_session(setup, 15, 0.02, seed=seed, zeros=offsets, spread=0.5)
-        X = solve(known.samples.problem(), LAX).estimate.X[0]
-        found, (t, r) = accuracy_of(known.samples, X), mount_error(X, known.X)
+        solution = solve(known.samples.problem(), LAX)
+        X = solution.estimate.X[0]
+        found, (t, r) = accuracy_of(known.samples, solution), mount_error(X, known.X)
         hand = missed(known, X, known.description, offsets)
         squares.append([(t / found.translation) ** 2, (r / found.rotation) ** 2, (hand / found.hand) ** 2])
     assert (np.mean(squares, axis=0) > 0.1).all()
