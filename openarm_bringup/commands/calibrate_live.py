@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +18,8 @@ from openarm_common.robot.folder import choose_robot
 if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
 
-    from openarm_bringup.calibration.run import CalibrationOptions
+    from openarm_bringup.calibration.run import CalibrationOptions, CalibrationRun
+    from openarm_calibration.handeye.zero_sets import ZerosCalibration
     from openarm_common.robot.servo_store import StoredServos
 
 #: Of the node's parameter auto.poses.
@@ -41,17 +43,18 @@ def auto(
 ) -> Outcome:
     """Calibrate automatically: the arm moves from one informative pose to the next, takes samples, and solves.
 
-    Starts a simulated robot with a board of its own, and stops it afterwards. Leaves a folder below runs/ with the
-    samples and a page with pictures for each camera. Ctrl-C stops the arm.
+    Starts a simulated robot with a board of its own, and stops it afterwards. For all cameras the board is in each hand
+    in turn, then on the table, and the samples determine the zeros of the joints with the mounts. Leaves a folder below
+    runs/ with the samples, a page with pictures for each board, and one for the zeros. Ctrl-C stops the arm.
 
     Args:
-        camera: Name of a camera, or "all" whose mounts are uncertain, one after the other.
+        camera: Name of a camera, at the zeros that are stored; or "all" whose mounts are uncertain, with the zeros.
         mount_seed: Of the simulated mounts, or "none"; that of the graph `calibrate` when not given.
         poses: Samples a camera at most; 0: the node's parameter auto.poses.
         save: Store the result, unless it fails the limits.
         store: Folder of stored calibrations.
         delay: Also measure how old images are at their stamps.
-        running: Use the graph that runs, with the board in place, instead of a simulated one.
+        running: Use the graph that runs, with the board in place, instead of a simulated one; of one camera.
         domain: ROS_DOMAIN_ID; a free one, or that of the running graph, when not given.
     """
     choose_robot(robot)
@@ -69,15 +72,18 @@ def auto(
         store_in(store)
     show = _Show()
     options = CalibrationOptions(
-        uncertain_cameras() if camera == "all" else (camera,),
-        mount_seed=seed, poses=poses, save=save, store=store, delay=delay, domain=domain, sets=tuple(set_),
+        uncertain_cameras() if camera == "all" else (camera,), mount_seed=seed, poses=poses, save=save,
+        zeros=camera == "all", store=store, delay=delay, domain=domain, sets=tuple(set_),
     )  # fmt: skip
     if running:
         return _running(options, show)
     run = run_calibration(options, CalibrationListeners(show.event, show.ready, show.camera, show.feedback))
-    for name in run.results:
-        _page(run.run_dir / f"{name}.npz", run.run_dir / f"{name}.html", store)
-    return _outcome(run.results, run.error, run.run_dir)
+    if run.found is not None:
+        _pages_of(run.found, run.sessions)
+    else:
+        for session in run.sessions:
+            _page(session, session.with_suffix(".html"), store)
+    return _outcome(run)
 
 
 def sample(*, remove: str | None = None, session: str = "", advice: bool = False, domain: Domain = None) -> Outcome:
@@ -204,6 +210,7 @@ def _running(options: CalibrationOptions, show: _Show) -> Outcome:
             Code.INVALID_ARGUMENT, "--running needs --camera NAME: the board has to be moved between the cameras"
         )
     join_graph(options.domain)
+    from openarm_bringup.calibration.run import CalibrationRun
     from openarm_calibration.ros.client import CalibrationClient
 
     show.camera(camera)
@@ -213,7 +220,7 @@ def _running(options: CalibrationOptions, show: _Show) -> Outcome:
             result = client.auto(camera, **options.goal, on_feedback=show.feedback, stop=stop)
         except KeyboardInterrupt:
             return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED)
-    return _outcome({camera: result}, None, None)
+    return _outcome(CalibrationRun(None, {camera: result}))
 
 
 class _Show(GraphReport):
@@ -238,48 +245,61 @@ class _Show(GraphReport):
             self._console.print(line, markup=False, soft_wrap=True)
 
 
-def _outcome(results: dict[str, AutoCalibrate.Result], error: OpenArmError | None, run_dir: Path | None) -> Outcome:
-    from openarm_bringup.calibration.run import as_row
-    from openarm_common.ros.convert import xyz
-
+def _outcome(run: CalibrationRun) -> Outcome:
+    """Return the end of a calibration: exit code and sentence follow the worst camera."""
+    rows, where = run.rows(), "" if run.run_dir is None else f"; samples, pages and logs are in {run.run_dir}"
     lines: list[str] = []
-    for name, result in results.items():
-        if not result.grade:
-            lines.append(f"{name}: {result.code}: {result.message}")
+    for name, row in rows.items():
+        if not row["grade"]:
+            lines.append(f"{name}: {row['code']}: {row['message']}")
             continue
-        x, y, z = xyz(result.mount.position) * 1e3
+        x, y, z = (f"{1e3 * line[3]:.2f}" for line in row["T_parent_link"][:3])
+        hand = f"; the hand meets what it sees to {1e3 * row['hand']:.2f} mm" if "hand" in row else ""
         lines.append(
-            f"{name}: {x:.2f}, {y:.2f}, {z:.2f} mm, accurate to {result.sigma_translation * 1e3:.3f} mm"
-            f" {math.degrees(result.sigma_rotation):.4f}°, {result.samples} samples in {result.duration:.0f} s;"
-            f" {result.message}"
+            f"{name}: {x}, {y}, {z} mm, accurate to {row['sigma_translation'] * 1e3:.2f} mm"
+            f" {math.degrees(row['sigma_rotation']):.3f}°{hand}; {row['samples']} samples; {row['message']}"
         )
-        if result.delay_sigma > 0.0:
-            delay, sigma = result.delay * 1e3, result.delay_sigma * 1e3
+        if row["delay"]:
+            delay, sigma = (1e3 * row["delay"][key] for key in ("seconds", "sigma"))
             lines.append(f"{name}: images are {delay:.2f} ± {sigma:.2f} ms old at their stamps")
-    data: dict[str, Any] = {"cameras": {name: as_row(result) for name, result in results.items()}}
-    if run_dir is not None:
-        data["run_dir"] = str(run_dir)
-    where = f"; samples, pages and logs are in {run_dir}" if run_dir is not None else ""
+    data: dict[str, Any] = {"cameras": rows}
+    if run.run_dir is not None:
+        data["run_dir"] = str(run.run_dir)
+    if run.found is not None:
+        lines += run.found.result.sentences()
+        data |= {"zeros": run.found.zeros.model_dump(mode="json"), "stored": list(run.stored)}
     text = "\n".join(lines)
-    if error is not None:
-        return Outcome(False, f"{error.message}{where}", error.code, data, text)
-    failed = [name for name, result in results.items() if not result.success or result.grade == "fail"]
+    if run.error is not None:
+        return Outcome(False, f"{run.error.message}{where}", run.error.code, data, text)
+    failed = [name for name, row in rows.items() if not row["success"] or row["grade"] == "fail"]
     if failed:
-        first = results[failed[0]]
-        code = Code(first.code) if first.code != Code.OK else Code.DEGENERATE
-        return Outcome(False, f"{failed[0]}: {first.message}{where}", code, data, text)
-    return Outcome(True, f"calibrated {', '.join(results)}{where}", data=data, text=text)
+        code = Code(rows[failed[0]]["code"])
+        message = f"{failed[0]}: {rows[failed[0]]['message']}{where}"
+        return Outcome(False, message, code if code != Code.OK else Code.DEGENERATE, data, text)
+    stored = f"; stored in {', '.join(run.stored)}" if run.stored else ""
+    return Outcome(True, f"calibrated {', '.join(rows)}{stored}{where}", data=data, text=text)
+
+
+def _pages_of(found: ZerosCalibration, sessions: Sequence[Path]) -> None:
+    """Write a page of each session next to it, with the zeros that were found, and one of these."""
+    from openarm_calibration.report.report import page, zeros_page
+    from openarm_calibration.sampling.samples import load_session
+    from openarm_common.robot.description import RobotDescription
+
+    for session, result in zip(sessions, found.cameras, strict=True):
+        samples, _ = load_session(session, RobotDescription.load())
+        text = page(samples.with_zeros(found.zeros.offsets), result)
+        session.with_suffix(".html").write_text(text, encoding="utf-8")
+    sessions[0].with_name("zeros.html").write_text(zeros_page(found), encoding="utf-8")
 
 
 def _page(session: Path, out: Path, store: Path | None) -> None:
-    """Write the page of a session, when there is one that can be solved."""
+    """Write the page of a session, when it can be solved."""
     from openarm_calibration.handeye.offline import calibrate
     from openarm_calibration.report.report import page
     from openarm_calibration.sampling.samples import load_session
     from openarm_common.robot.description import RobotDescription
 
-    if not session.is_file():
-        return
     samples, digest = load_session(session, RobotDescription.load())
     samples = at_stored_zeros(samples, store)
     try:

@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from openarm_bringup.calibration.run import store_found
 from openarm_bringup.calibration.source import ALL_SAMPLES, Source, opened, store_in, zeros_in
 from openarm_bringup.commands.connect import Domain, join_graph, requires_node
 from openarm_bringup.outcome import Outcome
@@ -22,6 +23,7 @@ def zeros(
     *samples: Path,
     sigma: float | None = None,
     prior: tuple[str, ...] = (),
+    level: float | None = None,
     page: Path | None = None,
     save: bool = False,
     force: bool = False,
@@ -37,6 +39,8 @@ def zeros(
             given.
         sigma: Deviation of a zero before anything is seen, degrees; the likeliest one when not given.
         prior: The same of single joints, as joint=degrees; 0: its zero is right.
+        level: Deviation of the tilt of the table that a board lies on, degrees: 0.05 where table and base were
+            levelled by a spirit level; not known when not given.
         page: HTML file to write: each joint, and each sample without the zeros and with them.
         save: Store zeros and mounts, unless they predict left-out samples no better than the present ones.
         force: Store them all the same.
@@ -51,8 +55,9 @@ def zeros(
     given = {
         "sigma": None if sigma is None else math.radians(sigma),
         "by_joint": dict(_prior(item) for item in prior),
+        "level": None if level is None else math.radians(level),
     }
-    config = validate(ZerosConfig, given, "--sigma and --prior", Code.INVALID_ARGUMENT)
+    config = validate(ZerosConfig, given, "--sigma, --prior and --level", Code.INVALID_ARGUMENT)
     if samples:
         read = [opened(path, source)[:2] for path in samples]
     else:
@@ -63,9 +68,12 @@ def zeros(
     if page is not None:
         data["page"] = str(page)
         write_whole(page, zeros_page(found).encode())
-    if found.failures and not force:
-        return Outcome(False, f"{'; '.join(found.failures)}; nothing was stored", Code.DEGENERATE, data, text)
-    message = "; ".join((*found.failures, *found.warnings)) or "left-out samples are predicted better with the zeros"
+    failures = found.failures
+    if not found.result.off:
+        failures = ("the samples show no joint whose zero is off: nothing is to be corrected", *failures)
+    if failures and not force:
+        return Outcome(False, f"{'; '.join(failures)}; nothing was stored", Code.DEGENERATE, data, text)
+    message = "; ".join((*failures, *found.warnings)) or "left-out samples are predicted better with the zeros"
     if not (save or force):
         return Outcome(True, f"{message}; --save stores zeros and mounts", data=data, text=text)
     if any(one.foreign for one, _ in read):
@@ -73,9 +81,7 @@ def zeros(
             Code.INVALID_ARGUMENT,
             "these samples are of a robot that this suite does not have; change its URDF",
         )
-    mounts = store_in(source.store)
-    data["stored"] = [str(mounts.save(mount)) for mount in found.mounts]
-    data["stored"].append(str(zeros_in(source.store).save(found.zeros)))
+    data["stored"] = [*store_found(found, store_in(source.store), zeros_in(source.store))]
     return Outcome(
         True, f"{message}. Stored in {', '.join(data['stored'])}; start the graph again", data=data, text=text
     )

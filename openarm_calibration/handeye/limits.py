@@ -13,8 +13,8 @@ from openarm_common.config import Config
 class Limits(Config):
     """When a calibration passes; beyond three times a limit it fails, between the two it is a warning."""
 
-    translation: float = Field(default=0.5e-3, gt=0.0, description="repeatability of the position, m")
-    rotation: float = Field(default=math.radians(0.05), gt=0.0, description="repeatability of the rotation, rad")
+    translation: float = Field(default=1e-3, gt=0.0, description="accuracy of the position, m")
+    rotation: float = Field(default=math.radians(0.1), gt=0.0, description="accuracy of the rotation, rad")
     held_out: float = Field(default=1e-3, gt=0.0, description="rms error at the board of poses that were left out, m")
     focal_known: float = Field(default=0.003, gt=0.0, description="deviation of a camera's stated focal length")
     centre_known: float = Field(default=3.0, gt=0.0, description="the same of its principal point, px")

@@ -7,19 +7,18 @@ where the arm had the same posture, and the mount of the board where both use th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from openarm_calibration.handeye.accuracy import accuracy_of
+from openarm_calibration.handeye.accuracy import Accuracy, accuracy_of
 from openarm_calibration.handeye.choice import solve_chosen
 from openarm_calibration.handeye.closed_form import REFINED, checked_algorithm, closed_form
 from openarm_calibration.handeye.left_out import side_by_side
 from openarm_calibration.handeye.observability import condition_number, require_motion
-from openarm_calibration.handeye.problem import Problem, View, assemble
+from openarm_calibration.handeye.problem import Problem, View, assemble, layout
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.unknowns import Estimate, Outlier, Solution, invert_scaled
@@ -30,6 +29,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.zeros import zeros_label
+from openarm_common.types import Mask
 
 #: Postures within this of each other have the same error of the robot, rad or m.
 _SAME_POSTURE = 1e-3
@@ -115,18 +115,33 @@ def judged(
     session: str = "",
     created: str = "",
     stored: StoredCalibration | None = None,
+    accuracy: Accuracy | None = None,
 ) -> Result:
-    """Judge a solution of a session, and make what is to be stored; arguments and errors as for `calibrate`."""
+    """Judge a solution of a session, and make what is to be stored; other arguments and errors as for `calibrate`.
+
+    Args:
+        samples: Of one camera.
+        solution: Of them.
+        algorithm: See `calibrate`.
+        limits: Of the verdict.
+        session: Hash of the session.
+        created: When.
+        stored: The calibration in use until now.
+        accuracy: Where zeros of the joints were solved for; None: determined by the samples.
+    """
     problem = solution.problem
     before = None if stored is None else stored.T_parent_link @ T_LINK_OPTICAL
-    verdict = assess(problem, solution, limits, before)
-    X = solution.estimate.X[0]
-    figures = verdict.figures
-    if problem.joints:
-        by_zeros = accuracy_of(samples, solution)
-        for name, value in (("translation", by_zeros.translation), ("rotation", by_zeros.rotation)):
-            figures[f"accuracy_{name}"] = math.hypot(figures[f"accuracy_{name}"], value)
-        figures.update(hand=by_zeros.hand, zeros_sigma=by_zeros.zeros)
+    unknown: tuple[str, ...] = ()
+    if accuracy is None and problem.joints:
+        try:
+            accuracy = accuracy_of(samples, solution)
+        except OpenArmError as error:
+            unknown = (f"the accuracy with zeros of the joints that may be off is not known: {error.message}",)
+    verdict = assess(problem, solution, limits, before, accuracy)
+    if unknown:
+        grade = "warn" if verdict.grade == "pass" else verdict.grade
+        verdict = replace(verdict, grade=grade, reasons=(*verdict.reasons, *unknown))
+    X, figures = solution.estimate.X[0], verdict.figures
     sigma_t, sigma_r = figures["accuracy_translation"], figures["accuracy_rotation"]
     if algorithm == REFINED and verdict.closed_form:
         algorithm = verdict.closed_form
@@ -244,28 +259,39 @@ def calibrate_together(
     solution = solve(joint, config)
     hashes = hashes or [""] * len(sessions)
     stored = stored or [None] * len(sessions)
-    parts = [_part(solution, camera, problem) for camera, problem in enumerate(own)]
+    parts = [part_of(solution, solution.problem.camera == camera, problem) for camera, problem in enumerate(own)]
     return tuple(
         judged(samples, part, limits=limits, session=digest, created=created, stored=before)
         for samples, part, digest, before in zip(sessions, parts, hashes, stored, strict=True)
     )
 
 
-def _part(joint: Solution, camera: int, own: Problem) -> Solution:
-    """Extract the solution of one camera and its board."""
+def part_of(joint: Solution, mine: Mask, own: Problem) -> Solution:
+    """Extract the solution of one camera and one board; of zeros of the joints it takes what was found for known.
+
+    Args:
+        joint: Of several cameras or boards.
+        mine: (n,) views of that camera and board.
+        own: The problem of these views alone.
+    """
     problem, estimate = joint.problem, joint.estimate
-    rows = np.flatnonzero(problem.camera == camera)
-    board = int(problem.board[rows[0]])
+    rows = np.flatnonzero(mine)
+    camera, board = int(problem.camera[rows[0]]), int(problem.board[rows[0]])
     first = 6 * camera, 6 * (problem.cameras + board)
     columns = np.concatenate([np.arange(start, start + 6) for start in first])
-    covariance = estimate.covariance()[np.ix_(columns, columns)]
+    whole = estimate.covariance()
+    covariance = whole[np.ix_(columns, columns)]
+    if "zeros" in estimate.extras:
+        zeros = layout(problem, estimate.extras)["zeros"]
+        across = whole[columns, zeros]
+        covariance = covariance - across @ np.linalg.solve(whole[zeros, zeros], across.T)
     information = invert_scaled(covariance)
     # corrections are numbered among the poses that were used
     numbers = np.unique(problem.pose[joint.used])
-    mine = np.unique(problem.pose[rows][joint.used[rows]])
+    used = np.unique(problem.pose[rows][joint.used[rows]])
     part = Estimate(
         estimate.X[camera : camera + 1], estimate.Z[board : board + 1],
-        estimate.correction[np.searchsorted(numbers, mine)], np.zeros((1, 4)), noise=estimate.noise,
+        estimate.correction[np.searchsorted(numbers, used)], np.zeros((1, 4)), noise=estimate.noise,
         information=information, spread=None if estimate.spread is None else covariance,
     )  # fmt: skip
     places = {int(row): k for k, row in enumerate(rows)}

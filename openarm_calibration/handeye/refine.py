@@ -117,6 +117,9 @@ def linearise(problem: Problem, state: State, extras: Sequence[Extra], priors: P
     left = expected - values(problem, state, extras)
     prior = np.diag(np.append(weight, np.sum(weight * left**2)))
     prior[:-1, -1] = prior[-1, :-1] = weight * left
+    tilt, by_turn = priors.tilts(problem, state.Z, size)
+    levelled = np.concatenate([by_turn, -tilt[:, None]], axis=1)
+    prior += levelled.T @ levelled
     return Linear(within, whole - within, prior, KMK, both, within_cost, float((costs - within_cost).sum()))
 
 

@@ -4,15 +4,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from openarm_calibration.handeye.problem import Extra, Problem, layout
 from openarm_calibration.handeye.spread import FLOOR
+from openarm_calibration.handeye.transforms import skews
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array, Mask
+
+#: Deviations of the joints' zeros that are compared, rad; the first says that zeros are right. Each answer starts from
+#: the one before: from the wide end, joints that mounts take up would wander and come back slowly.
+ZERO_SCALES = tuple(math.radians(degrees) for degrees in (0.001, 0.03, 0.06, 0.1, 0.2, 0.4, 1.0, 2.0, 4.0))
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,7 @@ class Priors:
         centre: Of cx and cy, px.
         distortion: Of k1 and of k2.
         zeros: (joints,) of the offsets, rad; None: infinite.
+        level: Boards that lie on a level table: deviation of the tilt about each axis by number of the board, rad.
     """
 
     scale: float = math.inf
@@ -65,6 +71,26 @@ class Priors:
     centre: float = math.inf
     distortion: float = math.inf
     zeros: Array | None = None
+    level: Mapping[int, float] = field(default_factory=dict[int, float])
+
+    def tilts(self, problem: Problem, Z: Array, size: int) -> tuple[Array, Array]:
+        """Return by how much boards that lie on a level table are tilted, and how that changes, over its deviation.
+
+        Args:
+            problem: The views.
+            Z: (boards, 4, 4) mounts, in a frame whose z axis is vertical.
+            size: Number of parameters.
+
+        Returns:
+            (n,) tilts, and (n, size) their derivatives.
+        """
+        tilt, by = np.zeros(2 * len(self.level)), np.zeros((2 * len(self.level), size))
+        for k, (board, deviation) in enumerate(self.level.items()):
+            vertical, rows = Z[board, 2, :3], slice(2 * k, 2 * k + 2)
+            turn = 6 * (problem.cameras + board) + 3
+            tilt[rows] = vertical[:2] / deviation
+            by[rows, turn : turn + 3] = skews(vertical[None])[0, :2] / deviation
+        return tilt, by
 
     def of(self, problem: Problem, extras: Sequence[Extra]) -> tuple[Array, Array]:
         """Return the deviations and expected values (parameters,) of all columns; mounts are free.

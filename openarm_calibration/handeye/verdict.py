@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -24,7 +24,11 @@ from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.types import Array
 
+if TYPE_CHECKING:
+    from openarm_calibration.handeye.accuracy import Accuracy
+
 Grade = Literal["pass", "warn", "fail"]
+GRADES: tuple[Grade, ...] = ("pass", "warn", "fail")
 #: Ratio to a limit beyond which a calibration fails.
 _FAIL = 3.0
 #: Of a robot whose joints are not known.
@@ -89,7 +93,13 @@ def estimate_delay(samples: SampleSet, config: SolveConfig | None = None, rounds
     return delay, sigma
 
 
-def assess(problem: Problem, solution: Solution, limits: Limits | None = None, stored: Array | None = None) -> Verdict:
+def assess(
+    problem: Problem,
+    solution: Solution,
+    limits: Limits | None = None,
+    stored: Array | None = None,
+    by_zeros: Accuracy | None = None,
+) -> Verdict:
     """Grade a solution of one camera.
 
     Args:
@@ -97,6 +107,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         solution: Of them.
         limits: None is the defaults.
         stored: (4, 4) the mount X in use until now, for the drift.
+        by_zeros: Accuracy with zeros of the joints that may be off; None: they are taken for exact.
     """
     limits = limits or Limits()
     sigma_t, sigma_r = solution.sigma()
@@ -111,6 +122,8 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         focal, focal_sigma = _focal(alternatives["focal length"].estimate, problem.intrinsics[0])
     better = rival(problem, solution, one_out)
     true_t, true_r = accuracy(solution, limits)
+    if by_zeros is not None:
+        true_t, true_r = math.hypot(true_t, by_zeros.translation), math.hypot(true_r, by_zeros.rotation)
     poses = len(np.unique(problem.pose[solution.used]))
     figures: dict[str, Any] = {
         "sigma_translation": sigma_t, "sigma_rotation": sigma_r,
@@ -127,19 +140,24 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         "outliers": {outlier.name: outlier.reason for outlier in solution.outliers},
         "causes": {cause.name: cause.evidence for cause in causes},
     }  # fmt: skip
+    because = ""
+    if by_zeros is not None:
+        figures |= {"hand": by_zeros.hand, "zeros_sigma": by_zeros.zeros}
+        if max(true_t / sigma_t, true_r / sigma_r) > 2.0:
+            because = f", as zeros of the joints are known to {math.degrees(by_zeros.zeros):.2f}°"
     outliers, views = len(solution.outliers), len(problem)
     arm = solution.estimate.noise
-    by_zeros = "wrong joint zeros; find them by `openarm calibrate zeros`" if problem.joints else _OF_POSES
+    spread = "wrong joint zeros; find them by `openarm calibrate zeros`" if problem.joints else _OF_POSES
     checks = [
-        Check("position", sigma_t / limits.translation, f"repeatability of the position {sigma_t * 1e3:.3f} mm"),
-        Check("rotation", sigma_r / limits.rotation, f"repeatability of the rotation {math.degrees(sigma_r):.4f}°"),
+        Check("position", true_t / limits.translation, f"accuracy of the position {true_t * 1e3:.2f} mm{because}"),
+        Check("rotation", true_r / limits.rotation, f"accuracy of the rotation {math.degrees(true_r):.3f}°{because}"),
         Check(
             "held out", one_out.metres / limits.held_out, f"held-out error {one_out.metres * 1e3:.3f} mm at the board"
         ),
         Check(
             "robot", arm.rotation / limits.robot,
             f"the hand seems off by {arm.translation * 1e3:.1f} mm and {math.degrees(arm.rotation):.2f}° from pose to"
-            f" pose, as with {by_zeros}",
+            f" pose, as with {spread}",
         ),
         Check(
             "contradictions", outliers / max(views, 1) / 0.1,

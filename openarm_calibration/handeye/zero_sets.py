@@ -14,20 +14,21 @@ from typing import Any
 
 import numpy as np
 
+from openarm_calibration.handeye.accuracy import accuracies
 from openarm_calibration.handeye.left_out import in_space_squares
+from openarm_calibration.handeye.limits import Limits
 from openarm_calibration.handeye.marks import project
-from openarm_calibration.handeye.problem import chain, layout
+from openarm_calibration.handeye.offline import Result, judged, part_of
+from openarm_calibration.handeye.problem import chain
 from openarm_calibration.handeye.unknowns import Solution
+from openarm_calibration.handeye.verdict import GRADES, Grade
 from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, arm_problem, solve_zeros
 from openarm_calibration.sampling.samples import SampleSet
-from openarm_calibration.store.store import StoredCalibration, versions
-from openarm_common import se3
-from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
+from openarm_calibration.store.store import StoredCalibration
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.zero_store import StoredZeros
-from openarm_common.robot.zeros import zeros_label
-from openarm_common.types import Array
 
 #: Groups of poses that are left out in turn.
 _FOLDS = 5
@@ -61,6 +62,7 @@ class ZerosCalibration:
     Args:
         result: Of the solver.
         zeros: To be stored.
+        cameras: Each session with the zeros that were found, judged.
         mounts: Of the cameras, to be stored with them.
         before: Errors of left-out poses with the zeros of the description.
         after: The same with the zeros that were found.
@@ -70,11 +72,30 @@ class ZerosCalibration:
 
     result: ZerosResult
     zeros: StoredZeros
+    cameras: tuple[Result, ...]
     mounts: tuple[StoredCalibration, ...]
     before: Predicted
     after: Predicted
     failures: tuple[str, ...]
     warnings: tuple[str, ...]
+
+    @property
+    def grade(self) -> Grade:
+        """The worst of all; fail, when zeros and mounts are not to be stored."""
+        grades: list[Grade] = [self.verdict(mount.camera)[0] for mount in self.mounts]
+        return max(grades, key=GRADES.index)
+
+    def verdict(self, camera: str) -> tuple[Grade, tuple[str, ...]]:
+        """Return the worst grade of the sessions of a camera, and why it is no pass."""
+        mine = [one.verdict for one in self.cameras if one.calibration.camera == camera]
+        grades: list[Grade] = [one.grade for one in mine]
+        grades.append("fail" if self.failures else "warn" if self.warnings else "pass")
+        reasons = dict.fromkeys(reason for one in mine for reason in one.reasons)
+        return max(grades, key=GRADES.index), (*reasons, *self.failures, *self.warnings)
+
+    def hand(self, camera: str) -> float:
+        """Return the distance of the hand from what a camera sees, of the arm with the largest, rms, m."""
+        return max(one.verdict.figures["hand"] for one in self.cameras if one.calibration.camera == camera)
 
     def as_json(self) -> dict[str, Any]:
         """Return it for `--json` and reports."""
@@ -82,6 +103,15 @@ class ZerosCalibration:
         return {
             "zeros": self.zeros.model_dump(mode="json"),
             "mounts": {mount.camera: mount.model_dump(mode="json") for mount in self.mounts},
+            "sessions": [
+                {
+                    "camera": one.calibration.camera,
+                    "grade": one.verdict.grade,
+                    "reasons": list(one.verdict.reasons),
+                    "figures": one.verdict.figures,
+                }
+                for one in self.cameras
+            ],
             "left_out": {"before": vars(self.before), "after": vars(self.after)},
             "outliers": {outlier.name: outlier.reason for outlier in solution.outliers},
             "noise": vars(solution.estimate.noise),
@@ -128,6 +158,7 @@ def calibrate_zeros(
     sessions: Sequence[SampleSet],
     config: ZerosConfig | None = None,
     *,
+    limits: Limits | None = None,
     hashes: Sequence[str] = (),
     created: str = "",
 ) -> ZerosCalibration:
@@ -136,6 +167,7 @@ def calibrate_zeros(
     Args:
         sessions: Of one robot; any number of cameras and arms.
         config: Priors.
+        limits: Of the verdicts.
         hashes: Of the sessions, for the record.
         created: When, as ISO 8601, for the record.
 
@@ -153,7 +185,8 @@ def calibrate_zeros(
     joints = dict(zip(result.names, zip(result.values, result.sigma, result.observable, strict=True), strict=True))
     joints = {name: row for name, row in joints.items() if name in described.joints}
     offsets = {name: float(value) if result.off else 0.0 for name, (value, _, _) in joints.items()}
-    places = list(dict.fromkeys((samples.head.camera, samples.head.parent) for samples in sessions))
+    heads = [(samples.head.camera, samples.head.parent) for samples in sessions]
+    places = list(dict.fromkeys(heads))
     zeros = StoredZeros(
         of=sessions[0].head.zeros_of,
         offsets=offsets,
@@ -164,12 +197,19 @@ def calibrate_zeros(
         sessions=tuple(hashes),
         created=created,
     )
+    cameras: list[Result] = []
+    hashes = hashes or [""] * len(sessions)
+    for board, (samples, accuracy) in enumerate(zip(sessions, accuracies(sessions, result), strict=True)):
+        zeroed = samples.with_zeros(offsets)
+        part = part_of(result.solution, result.solution.problem.board == board, zeroed.problem())
+        cameras.append(judged(zeroed, part, limits=limits, session=hashes[board], created=created, accuracy=accuracy))
+    used = result.solution.problem.camera[result.solution.used]
     mounts = tuple(
-        _mount(result, k, place, optics[k], next(s for s in sessions if s.head.camera == place[0]), zeros)
+        cameras[heads.index(place)].calibration.model_copy(update={"samples": int(np.count_nonzero(used == k))})
         for k, place in enumerate(places)
     )
     failures, warnings = _doubts(result, before, after, len(views))
-    return ZerosCalibration(result, zeros, mounts, before, after, failures, warnings)
+    return ZerosCalibration(result, zeros, tuple(cameras), mounts, before, after, failures, warnings)
 
 
 def _doubts(
@@ -177,9 +217,7 @@ def _doubts(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     failures: list[str] = []
     warnings: list[str] = []
-    if not result.off:
-        failures.append("the samples show no joint whose zero is off: nothing is to be corrected")
-    elif not (after.metres < before.metres and after.px < before.px):
+    if result.off and not (after.metres < before.metres and after.px < before.px):
         failures.append(
             f"with the zeros left-out poses are predicted no better ({after.px:.2f} px, {after.metres * 1e3:.2f} mm)"
             f" than without ({before.px:.2f} px, {before.metres * 1e3:.2f} mm); take more samples, of all joints"
@@ -223,36 +261,3 @@ def _predicted(
             by_name[view.name] = float(np.sqrt(np.mean(np.sum(away**2, axis=1)))), float(np.sqrt(space[k]))
     px, metres = np.median(list(by_name.values()), axis=0).tolist()
     return Predicted(px, metres, by_name)
-
-
-def _mount(
-    result: ZerosResult,
-    number: int,
-    place: tuple[str, str],
-    optics: Intrinsics,
-    samples: SampleSet,
-    zeros: StoredZeros,
-) -> StoredCalibration:
-    """Return the mount of a camera for the store, with its predicted error where the zeros are those that were found.
-
-    Args:
-        result: Of the solver.
-        number: Of the camera.
-        place: Its name, and the link that carries it.
-        optics: Its intrinsics.
-        samples: One of its sessions.
-        zeros: To be stored with it.
-    """
-    estimate = result.solution.estimate
-    covariance: Array = estimate.covariance()
-    mine, others = slice(6 * number, 6 * number + 6), layout(result.solution.problem, estimate.extras)["zeros"]
-    across = covariance[mine, others]
-    given = covariance[mine, mine] - across @ np.linalg.solve(covariance[others, others], across.T)
-    variance = np.maximum(np.diag(given), 0.0)
-    views = result.solution.problem.camera[result.solution.used] == number
-    return StoredCalibration.of_mount(
-        *place, estimate.X[number] @ se3.inverse(T_LINK_OPTICAL), intrinsics=optics,
-        sigma_translation=math.sqrt(variance[:3].sum()), sigma_rotation=math.sqrt(variance[3:].sum()),
-        mount_seed=samples.head.mount_seed, board=samples.board.label, samples=int(np.count_nonzero(views)),
-        created=zeros.created, zeros=zeros_label(zeros.offsets), versions=versions(),
-    )  # fmt: skip

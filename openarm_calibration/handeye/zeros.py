@@ -6,7 +6,8 @@ arms share the offsets of the joints that they have in common; each set has the 
 flexure, `compliance × torque` of a joint that gives way under load, may be unknowns too.
 
 A mount takes up the offset of the joint next to it: a camera or board that stands still on the base that of the first
-joint, one in the hand that of the last. There the prior decides, and `ZerosResult` says so joint by joint. The forward
+joint, one in the hand that of the last. There the prior decides, and `ZerosResult` says so joint by joint. A board that
+lies on a level table determines the first one, where its axis is horizontal, and the tilt of fixed cameras. The forward
 kinematics is exact, and linearised again at each step (iterated least squares, as in Hollerbach and Wampler 1996, "The
 calibration index and taxonomy for robot kinematic calibration methods"). m, rad, N m.
 """
@@ -21,9 +22,9 @@ import numpy as np
 from pydantic import Field
 
 from openarm_calibration.handeye.kinematics import Kinematics, Posture
-from openarm_calibration.handeye.problem import Problem, View, assemble, layout
+from openarm_calibration.handeye.problem import SETUPS, Problem, View, assemble, layout
 from openarm_calibration.handeye.solve import SolveConfig, solve
-from openarm_calibration.handeye.unknowns import Priors, Solution
+from openarm_calibration.handeye.unknowns import ZERO_SCALES, Priors, Solution
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
@@ -31,14 +32,13 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.urdf import Joint
 from openarm_common.types import Array
 
-#: Deviations of the offsets that are compared, rad; the first says that zeros are right. Each answer starts from the
-#: one before: from the wide end, joints that mounts take up would wander and come back slowly.
-_SCALES = tuple(math.radians(degrees) for degrees in (0.001, 0.03, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0))
 #: Twice the logarithm of the likelihood ratio from which the zeros count as wrong: very strong evidence (Kass and
 #: Raftery 1995, "Bayes factors").
 _EVIDENT = 10.0
-#: Posterior over prior deviation up to which the data tell a joint; two joints that only differ by a mount have 0.71.
-_TOLD = 0.5
+#: Posterior over prior deviation up to which the data determine a joint; two that only differ by a mount have 0.71.
+_DETERMINED = 0.5
+#: Boards that are tilted by less lie on the table, with zeros that are off, rad.
+_LYING = math.radians(5.0)
 
 
 class ZerosConfig(Config):
@@ -52,6 +52,9 @@ class ZerosConfig(Config):
     )
     lengths: float | None = Field(default=None, gt=0.0, description="of links' lengths, m; None: as described")
     flexure: float | None = Field(default=None, gt=0.0, description="of joints' compliance, rad/(N m); None: stiff")
+    level: float | None = Field(
+        default=None, gt=0.0, description="of the tilt of the table on which a board lies, rad; None: unknown"
+    )
     solver: SolveConfig = Field(
         # a misfit would explain zeros that are off as well
         default=SolveConfig(misfit=False, most_translation=10.0, most_rotation=10.0),
@@ -106,12 +109,12 @@ class ZerosResult:
     @property
     def off(self) -> bool:
         """Whether the samples show that zeros are off at all, where that was to be found out."""
-        return bool(self.prior.max(initial=0.0) > _SCALES[0])
+        return bool(self.prior.max(initial=0.0) > ZERO_SCALES[0])
 
     @property
     def observable(self) -> tuple[bool, ...]:
         """Whether the data tell each parameter; where not, the prior decides."""
-        return tuple(bool(s < _TOLD * p) for s, p in zip(self.sigma, self.prior, strict=True))
+        return tuple(bool(s < _DETERMINED * p) for s, p in zip(self.sigma, self.prior, strict=True))
 
     def mounts_covariance(self) -> Array:
         """(parameters, parameters) of everything: mounts of cameras, then of boards, then these parameters."""
@@ -136,7 +139,7 @@ class ZerosResult:
             elif observable:
                 out.append(f"{name}: {figure}")
             else:
-                out.append(f"{name}: {figure}; no view tells it from a mount or another joint: the prior decides")
+                out.append(f"{name}: {figure}; a mount or another joint takes it up: the prior decides")
         return tuple(out)
 
 
@@ -166,7 +169,7 @@ def _parameters(
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"a prior for {name!r}, which moves nothing here; joints: {', '.join(joints)}"
             )
-    names, sigma = list(joints), [config.by_joint.get(name, config.sigma or _SCALES[-1]) for name in joints]
+    names, sigma = list(joints), [config.by_joint.get(name, config.sigma or ZERO_SCALES[-1]) for name in joints]
     if config.lengths is not None:
         long = [name for name in joints if _has_length(description.joint(name))]
         names += [f"{name} length" for name in long]
@@ -195,6 +198,13 @@ def arm_problem(
     chains = {ends: Kinematics(description, *ends, names) for ends in {(view.base, view.tip) for view in views}}
     armed = [replace(view.view, arm=Posture(chains[view.base, view.tip], view.q, view.torque)) for view in views]
     return assemble(armed, intrinsics, [view.guess for view in views])
+
+
+def _lying(solution: Solution) -> tuple[int, ...]:
+    """Return the boards that stand still on the base and are about level."""
+    problem, level = solution.problem, np.abs(solution.estimate.Z[:, 2, 2]) > math.cos(_LYING)
+    still = np.unique(problem.board[problem.kind == SETUPS.index("in_hand")])
+    return tuple(int(board) for board in still if level[board])
 
 
 def solve_zeros(
@@ -227,15 +237,19 @@ def solve_zeros(
     trusting = solver.model_copy(update={"reject_outliers": False})
     answers: list[tuple[Array, Solution]] = []
     given = () if config.sigma is None else (config.sigma,)
-    for scale in _SCALES if not given else given if start is not None else (_SCALES[0], *given):
+    level: dict[int, float] = {}
+    if config.level is not None:
+        start = start or solve(problem, trusting, Priors(zeros=np.full(len(names), ZERO_SCALES[0])))
+        level = dict.fromkeys(_lying(start), config.level)
+    for scale in ZERO_SCALES if not given else given if start is not None else (ZERO_SCALES[0], *given):
         _, sigma = _parameters(description, views, config.model_copy(update={"sigma": scale}))
-        start = solve(problem, trusting, Priors(zeros=sigma), start=start)
+        start = solve(problem, trusting, Priors(zeros=sigma, level=level), start=start)
         answers.append((sigma, start))
     prior, solution = answers[-1] if given else min(answers, key=lambda answer: answer[1].estimate.evidence)
     if not given and not solution.estimate.evidence < answers[0][1].estimate.evidence - _EVIDENT:
         prior, solution = answers[0]
     if solver.reject_outliers:
-        solution = solve(problem, solver, Priors(zeros=prior), start=solution)
+        solution = solve(problem, solver, Priors(zeros=prior, level=level), start=solution)
     estimate, covariance = solution.estimate, solution.estimate.covariance()
     columns = layout(solution.problem, estimate.extras)["zeros"]
     return ZerosResult(names, estimate.zeros, covariance[columns, columns], prior, solution)

@@ -106,7 +106,7 @@ class _Run:
         self._node, self._mover, self._handle, self._result = node, mover, handle, result
         self._goal: AutoCalibrate.Goal = handle.request
         self._config = config = node.config.auto
-        node.use(self._goal.camera or node.camera.name)
+        node.use(self._goal.camera or node.camera.name, self._goal.carrier)
         head = node.samples.head
         self._arm = node.description.arm_of(head.parent if head.setup == "in_hand" else head.carrier)
         self._poses = int(self._goal.poses) or config.poses
@@ -115,7 +115,7 @@ class _Run:
         fixed = head.setup == "to_hand"
         place = (config.on_hand if fixed else config.on_table).pose
         if place is None and config.as_in_scene:
-            place = board_of(node.camera, node.description)[1]
+            place = board_of(node.camera, node.description, self._arm)[1]
         self._fixed = fixed
         self._search = PoseSearch(node.description, node.camera.T_parent_optical, place, config.search)
 

@@ -38,6 +38,7 @@ class CalibrationClient(BackgroundNode):
         self,
         camera: str = "",
         *,
+        carrier: str = "",
         poses: int = 0,
         sigma: tuple[float, float] = (0.0, 0.0),
         measure_delay: bool = False,
@@ -51,8 +52,9 @@ class CalibrationClient(BackgroundNode):
 
         Args:
             camera: Its name; empty is the one the node was started for.
+            carrier: Link that holds the board of a fixed camera; empty is the node's parameter.
             poses: Samples at most; 0 is the node's parameter.
-            sigma: Predicted errors that are enough, m and rad; 0 is the node's parameter.
+            sigma: Repeatability that is enough, m and rad; 0 is the node's parameter.
             measure_delay: Also measure the age of the images.
             save: Store the result, unless it fails the limits.
             session: File for the samples (.npz, as the node sees the file system); empty is none.
@@ -64,7 +66,7 @@ class CalibrationClient(BackgroundNode):
             OpenArmError: NOT_READY, when no calibration node answers; TIMEOUT.
         """
         goal = AutoCalibrate.Goal(camera=camera, poses=poses, measure_delay=measure_delay, save=save, session=session)
-        goal.sigma_translation, goal.sigma_rotation = sigma
+        goal.carrier, (goal.sigma_translation, goal.sigma_rotation) = carrier, sigma
         answer: AutoCalibrate.Result = self.do(
             AutoCalibrate, "/calibration/auto", goal, timeout=timeout, on_feedback=on_feedback, stop=stop
         )

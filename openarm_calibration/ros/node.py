@@ -87,15 +87,19 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         self._auto = AutoCalibrateServer(self)
 
     # --- the session
-    def use(self, name: str) -> None:
+    def use(self, name: str, carrier: str = "") -> None:
         """Start over with a camera, without samples.
 
+        Args:
+            name: Of the camera.
+            carrier: Link that holds the board of a fixed camera; "": the parameter.
+
         Raises:
-            OpenArmError: CONFIG_INVALID, listing the cameras.
+            OpenArmError: CONFIG_INVALID, listing the cameras or the links.
         """
         if name not in self._cameras:
             raise OpenArmError(Code.CONFIG_INVALID, f"no camera {name!r}; cameras: {', '.join(self._cameras)}")
-        self.camera = self._cameras[name]
+        self.camera, self._carrier = self._cameras[name], carrier or self.config.carrier
         self.capture = ImageCapture(self, self._states, name, self.config)
         self._change(SampleSet(self._head(self.camera.intrinsics), self.description))
 
@@ -181,7 +185,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         seed = self.config.seed if self.camera.mount_error else None
         return head_of(
             self.camera.name, self.camera.parent, self.description, optics,
-            read_board(self.config.board, "parameter board"), self.config.carrier, mount_seed=seed, created=now(),
+            read_board(self.config.board, "parameter board"), self._carrier, mount_seed=seed, created=now(),
         )  # fmt: skip
 
     def _check_optics(self, optics: Intrinsics) -> None:

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a calibration board is for each camera of a robot; it follows from the robot's folder. Base frame = world, m.
 
-For a fixed camera the last arm holds it ahead of its fingers; for one that moves it lies on the table.
+For a fixed camera an arm holds it ahead of its fingers; for one that moves it lies on the table.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,26 +36,66 @@ _ROOM, _TRIES, _AWAY = 0.015, 4000, 1.5
 _MIDDLE = 0.02
 
 
-def board_scenes() -> dict[str, CameraConfig]:
-    """Return the cameras of this process's robot by the names of the scenes with a board for them.
+class Place(NamedTuple):
+    """A board for a camera.
+
+    Args:
+        camera: Which.
+        arm: That holds it, for a fixed camera; "": it lies on the table.
+    """
+
+    camera: CameraConfig
+    arm: str
+
+    @property
+    def scene(self) -> str:
+        """Name of the scene with the board; the last arm is not named."""
+        last = self.arm in ("", RobotDescription.load().arm_names[-1])
+        return f"{CALIBRATION}_{self.camera.name}" + ("" if last else f"_{self.arm}_arm")
+
+
+def board_places(cameras: Sequence[str], *, every_arm: bool = True) -> tuple[Place, ...]:
+    """Return where a board is needed to calibrate cameras: in each arm's hand for a fixed one, the last arm's first.
+
+    Args:
+        cameras: Names.
+        every_arm: Whether every arm is to hold it, not the last one alone.
+    """
+    known, description = load_cameras(), RobotDescription.load()
+    arms = description.arm_names[::-1] if every_arm else description.arm_names[-1:]
+    return tuple(
+        Place(known[name], arm)
+        for name in cameras
+        for arm in (("",) if description.arm_of(known[name].parent) else arms)
+    )
+
+
+def board_scenes() -> dict[str, Place]:
+    """Return the boards for the cameras of this process's robot by the names of their scenes.
 
     `calibration` is for the camera that is calibrated when none is named.
     """
-    cameras = load_cameras()
-    scenes = {f"{CALIBRATION}_{name}": cameras[name] for name in uncertain_cameras()}
-    first = near_camera() or table_camera()
-    return scenes | ({CALIBRATION: cameras[first]} if first in uncertain_cameras() else {})
+    scenes = {place.scene: place for place in board_places(uncertain_cameras())}
+    first = scenes.get(f"{CALIBRATION}_{near_camera() or table_camera()}")
+    return scenes | ({} if first is None else {CALIBRATION: first})
 
 
-def board_of(camera: CameraConfig, description: RobotDescription) -> tuple[str, Array]:
-    """Return the link that carries the board for a camera ("": the world), and its pose in the frame of it, (4, 4)."""
+def board_of(camera: CameraConfig, description: RobotDescription, arm: str = "") -> tuple[str, Array]:
+    """Return the link that carries the board for a camera ("": the world), and its pose in the frame of it, (4, 4).
+
+    Args:
+        camera: Which.
+        description: The robot.
+        arm: That holds it, for a fixed camera; "": the last one.
+    """
     anyhow = dict.fromkeys(description.joints, 0.0)
     moves = description.arm_of(camera.parent)
     if not moves:
-        arm = description.arm(description.arm_names[-1])
-        T_flange_tcp = se3.inverse(description.link_pose(arm.flange, anyhow)) @ description.link_pose(arm.tcp, anyhow)
+        holder = description.arm(arm or description.arm_names[-1])
+        flange, tcp = (description.link_pose(link, anyhow) for link in (holder.flange, holder.tcp))
+        T_flange_tcp = se3.inverse(flange) @ tcp
         T_flange_board = T_flange_tcp @ se3.make(_HELD, (0.0, 0.0, _AHEAD))
-        return arm.flange, se3.make(T_flange_board[:3, :3], T_flange_board[:3, 3].round(3))
+        return holder.flange, se3.make(T_flange_board[:3, :3], T_flange_board[:3, 3].round(3))
     work = robot_work()
     shoulder = float(description.link_pose(description.arm(moves).base, anyhow)[1, 3])
     y = float(np.sign(shoulder)) * _ASIDE if abs(shoulder) > _MIDDLE else 0.0
@@ -62,7 +103,7 @@ def board_of(camera: CameraConfig, description: RobotDescription) -> tuple[str, 
     return "", se3.make(se3.rotation_from_z_y(*_LYING), place)
 
 
-def board_start(camera: CameraConfig) -> dict[str, float]:
+def board_start(place: Place) -> dict[str, float]:
     """Return where the joints are when a calibration begins, rad or m: hands open, and the board clear of everything.
 
     The arm that holds the board is at home, or as near to it as a posture is found; open fingers hide less.
@@ -72,7 +113,7 @@ def board_start(camera: CameraConfig) -> dict[str, float]:
     """
     description = RobotDescription.load()
     start = {hand.joint: hand.opened for hand in description.hands.values()}
-    link, T_link_board = board_of(camera, description)
+    link, T_link_board = board_of(place.camera, description, place.arm)
     if not link:
         return start
     from openarm_common.collision.self_collision import SelfCollision
@@ -105,8 +146,8 @@ def board_start(camera: CameraConfig) -> dict[str, float]:
     )
 
 
-def board_scene(camera: CameraConfig) -> dict[str, Any]:
-    """Return the scene with the board for a camera, as a file would say it."""
-    link, T_link_board = board_of(camera, RobotDescription.load())
+def board_scene(place: Place) -> dict[str, Any]:
+    """Return the scene with a board, as a file would say it."""
+    link, T_link_board = board_of(place.camera, RobotDescription.load(), place.arm)
     axes = {name: T_link_board[:3, k].tolist() for name, k in (("position", 3), ("z_axis", 2), ("y_axis", 1))}
     return {"objects": [], "fixtures": [{"name": "board", "model": _MODEL, "link": link, **axes}]}

@@ -349,7 +349,8 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
 
     Args:
         source: Name of a file in `models/scenes` or in `scenes` of the robot's folder, which has precedence, a path
-            ending in .yaml, "random", or `calibration_CAMERA`: the board for a camera.
+            ending in .yaml, "random", or `calibration_CAMERA`: the board for a camera, in the last arm's hand if it is
+            fixed (`calibration_CAMERA_NAME_arm`: in another one's).
         seed: Of a random scene.
 
     Raises:
@@ -365,8 +366,8 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
         from openarm_common.scene.boards import board_scene, board_scenes
 
         boards = board_scenes()
-        if camera := boards.get(str(source)):
-            return parse_scene({"name": str(source), **board_scene(camera)}, str(source))
+        if place := boards.get(str(source)):
+            return parse_scene({"name": str(source), **board_scene(place)}, str(source))
         names = sorted({*boards, *(file.stem for folder in _folders() for file in folder.glob("*.yaml"))})
         raise OpenArmError(
             Code.SCENE_INVALID,

@@ -27,7 +27,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, load_cameras, uncertain_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.boards import CALIBRATION
+from openarm_common.scene.boards import Place
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Array
 from openarm_evaluation.campaign.robot import shared_renderer
@@ -90,11 +90,8 @@ class Bench:
     ) -> None:
         self._zeros = zeros or {}
         self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load().described
-        scene = load_scene(f"{CALIBRATION}_{camera.name}")
+        scene = load_scene(Place(camera, arm).scene)
         board = scene.fixtures[0]
-        if arm:
-            board = board.model_copy(update={"link": self._description.arm(arm).flange})
-            scene = scene.model_copy(update={"fixtures": (board,)})
         self._fixed = bool(board.link)
         self._carrier = board.link or camera.parent
         self._T_carrier_board = board.T_link_fixture

@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from openarm_bringup.calibration.run import CalibrationListeners, CalibrationOptions, run_calibration
+from openarm_bringup.calibration.run import GRAPH, CalibrationListeners, CalibrationOptions, run_calibration
+from openarm_bringup.supervision.environment import zeros_name
+from openarm_bringup.supervision.graph import load_graph
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.store.store import of_these_mounts, places
 from openarm_common.camera.cameras import load_cameras, true_mount, uncertain_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder
+from openarm_common.robot.zero_store import ZeroStore
 
 
 def uncalibrated(mount_seed: int) -> tuple[str, ...]:
@@ -30,6 +33,8 @@ def uncalibrated(mount_seed: int) -> tuple[str, ...]:
 def calibrate_once(mount_seed: int, on_note: Callable[[str], None]) -> None:
     """Calibrate the cameras that are not yet, in a graph of its own, and store the result for next time.
 
+    The zeros of the joints are determined and stored with the first ones.
+
     Raises:
         OpenArmError: What kept it from working, or DEGENERATE, when a result was not good enough to be stored.
     """
@@ -39,12 +44,17 @@ def calibrate_once(mount_seed: int, on_note: Callable[[str], None]) -> None:
     on_note(f"no calibration of mount seed {mount_seed} yet: {', '.join(cameras)} are calibrated first, once")
     store = default_folder() / f"mount_seed_{mount_seed}"
     listeners = CalibrationListeners(on_camera=lambda camera: on_note(f"calibrating {camera}"))
-    run = run_calibration(CalibrationOptions(cameras, mount_seed=mount_seed, save=True, store=store), listeners)
+    zeros = ZeroStore(default_folder()).find(zeros_name(load_graph(GRAPH))) is None
+    options = CalibrationOptions(
+        cameras, mount_seed=mount_seed, save=True, zeros=zeros, zeros_store=default_folder(), store=store
+    )
+    run = run_calibration(options, listeners)
     if run.error is not None:
         raise run.error
-    for camera, result in run.results.items():
-        if not result.success:
-            raise OpenArmError(Code(result.code), f"calibration of {camera}: {result.message}")
+    for camera, row in run.rows().items():
+        if not row["success"] or row["grade"] == "fail":
+            code = Code.DEGENERATE if row["success"] else Code(row["code"])
+            raise OpenArmError(code, f"calibration of {camera}: {row['message']}")
     left = uncalibrated(mount_seed)
     if left:
         raise OpenArmError(Code.INTERNAL, f"{', '.join(left)} are stored in {store}, but not found there")

@@ -13,6 +13,7 @@ import pytest
 from openarm_interfaces.action import AutoCalibrate
 
 from openarm_bringup.calibration import run as calibration
+from openarm_calibration.handeye import zero_sets
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import Code, OpenArmError
@@ -211,7 +212,8 @@ def test_auto_takes_the_fixed_camera_first_and_reports_the_results(
     def run_it(options, listeners):
         asked.append(options)
         make_session("in_hand", 12).samples.save(tmp_path / "wrist.npz")
-        return calibration.CalibrationRun(tmp_path, results, 1.0, error)
+        sessions = [tmp_path / "wrist.npz"] if "wrist" in results else []
+        return calibration.CalibrationRun(tmp_path, results, sessions, error=error)
 
     monkeypatch.setattr(calibration, "run_calibration", run_it)
     got, data = answer_of(capsys, "calibrate", "auto", "--mount-seed", "3", "--poses", "12", "--save")
@@ -223,3 +225,36 @@ def test_auto_takes_the_fixed_camera_first_and_reports_the_results(
     assert list(rows) == list(results)
     assert all(row["delay"] == {"seconds": 0.02, "sigma": 1e-4} for row in rows.values())
     assert (tmp_path / "wrist.html").is_file() == ("wrist" in results)
+
+
+@pytest.mark.long
+@pytest.mark.requirement("B-15", "R-11")
+def test_auto_reports_mounts_as_they_are_with_the_zeros_and_stores_both(capsys, tmp_path: Path, monkeypatch) -> None:
+    """What the node says of each camera alone is replaced; a page of each board and one of the zeros are written."""
+    monkeypatch.setattr(zero_sets, "_FOLDS", 2)
+    zeros = {f"openarm_{arm}_joint{k}": 2e-3 * (-1) ** k for arm in ("right", "left") for k in range(2, 7)}
+
+    def run_it(options, listeners):
+        assert options.zeros
+        run = calibration.CalibrationRun(tmp_path, {name: result(name) for name in ("overhead", "wrist")})
+        for name, setup, arm in (("overhead", "to_hand", "right"), ("overhead_left_arm", "to_hand", "left"),
+                                 ("wrist", "in_hand", "right")):  # fmt: skip
+            known = make_session(setup, 9, 0.02, arm=arm, zeros=zeros, spread=0.5, lying=setup == "in_hand")
+            known.samples.save(tmp_path / f"{name}.npz")
+            run.sessions.append(tmp_path / f"{name}.npz")
+        run.found = calibration.together(run.sessions, options.level)
+        run.stored = calibration.store_found(run.found, *options.stores())
+        return run
+
+    monkeypatch.setattr(calibration, "run_calibration", run_it)
+    got, data = answer_of(capsys, "calibrate", "auto", "--mount-seed", "1", "--save")
+    assert got == 0
+    assert {path.stem for path in tmp_path.glob("*.html")} == {"overhead", "overhead_left_arm", "wrist", "zeros"}
+    for name, row in data["cameras"].items():
+        assert row["path"] in data["stored"]
+        assert row["samples"] == {"overhead": 18, "wrist": 9}[name]
+        assert 1e-5 < row["hand"] < 1e-3
+        assert row["message"].startswith(f"{row['grade']}: ")
+        assert re.search(f"{row['sigma_translation'] * 1e3:.3f}", (tmp_path / f"{name}.html").read_text())
+    assert all(abs(data["zeros"]["offsets"][name] - zero) < 5e-4 for name, zero in zeros.items())
+    assert len(data["stored"]) == 3

@@ -127,7 +127,7 @@ def test_zeros_that_are_right_are_left_alone_and_nothing_is_stored(
         (["--prior", "openarm_right_joint3"], "expected joint=degrees"),
         (["--prior", "openarm_right_joint3=much"], "expected joint=degrees"),
         (["--prior", "elbow=1"], "joints: openarm_right_joint1"),
-        (["--sigma", "-1"], "--sigma and --prior"),
+        (["--sigma", "-1"], "--sigma, --prior and --level"),
     ],
 )
 def test_wrong_priors_are_refused_with_what_is_valid(capsys, tmp_path: Path, argv: list[str], part: str) -> None:

@@ -42,8 +42,8 @@ def test_mount_seed_1_needs_no_calibration_and_others_are_calibrated_once(tmp_pa
     before = mounts.errors(5, nominal=False)["overhead"]
     mounts.calibrate_once(5, notes.append)
     mounts.calibrate_once(5, notes.append)
-    assert [(options.cameras, options.mount_seed, options.save) for options in asked] == [
-        (("overhead", "wrist"), 5, True)
+    assert [(options.cameras, options.mount_seed, options.save, options.zeros) for options in asked] == [
+        (("overhead", "wrist"), 5, True, True)
     ]
     assert "no calibration of mount seed 5 yet" in notes[0]
     after = mounts.errors(5, nominal=False)["overhead"]

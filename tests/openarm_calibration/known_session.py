@@ -21,6 +21,8 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 
 BOARD = CircleGrid()
+#: Joints of the right arm with which its camera looks down, rad.
+_ABOVE_TABLE = (0.4, 3.1, -0.6, 1.95, 0.25, 0.7, 1.2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +80,13 @@ def make_session(
     seed: int = 0,
     arm: str = "right",
     zeros: Mapping[str, float] | None = None,
+    lying: bool = False,
 ) -> Known:
     """Return samples at random joints around a view of the board.
 
     With `speed` (rad/s) the arm moves at every image; `arm` holds the board of a fixed camera; joints report their
-    positions minus `zeros` (rad).
+    positions minus `zeros` (rad); a board that is `lying` is level, below
+    a camera in the hand.
     """
     rng = np.random.default_rng(seed)
     description = RobotDescription.load()
@@ -97,10 +101,12 @@ def make_session(
     samples = SampleSet(head, description)
     names = samples.joint_names
     home = description.group_state(f"{arm}_arm", "home")
-    middle = np.array([home[name] for name in names])
+    middle = np.array(_ABOVE_TABLE if lying else [home[name] for name in names])
     X = true_mount(camera, 1) @ T_LINK_OPTICAL
     A = samples.pose(dict(zip(names, middle, strict=True)))
     seen = se3.make(se3.rot_x(0.3) @ se3.rot_z(0.2), (0.0, 0.0, 0.36 if setup == "in_hand" else 0.6))
+    if lying:
+        seen[:3, :3] = (A @ X)[:3, :3].T @ se3.rotation_from_z_y((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))
     Z = A @ X @ seen if setup == "in_hand" else se3.inverse(A) @ X @ seen
     row = np.array([k.fx, k.fy, k.cx, k.cy])
 

@@ -175,7 +175,7 @@ def test_the_verdict_has_held_out_errors_and_reasons(session) -> None:
     solution = solve(problem)
     good = assess(problem, solution, stored=known.X)
     assert good.grade == "pass", good.reasons
-    sigma = good.figures["sigma_translation"]
+    sigma = good.figures["accuracy_translation"]
     grades = [assess(problem, solution, Limits(translation=sigma / ratio)).grade for ratio in (0.9, 2.0, 5.0)]
     assert grades == ["pass", "warn", "fail"]
     assert good.figures["leave_one_out"] < 0.5e-3

@@ -12,14 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.joint_zeros import groups, solved, trial
+from openarm_calibration.handeye import zero_sets
 from openarm_calibration.handeye.kinematics import Kinematics
+from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig
 from openarm_calibration.handeye.transforms import difference
 from openarm_calibration.handeye.unknowns import Noise
-from openarm_calibration.handeye.zero_sets import arm_views
+from openarm_calibration.handeye.zero_sets import arm_views, calibrate_zeros
 from openarm_calibration.handeye.zeros import ZerosConfig, solve_zeros
+from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
+from tests.openarm_calibration.known_session import make_session
 
 LAX = SolveConfig(most_translation=10.0, most_rotation=10.0)
 ROBOT = RobotDescription.load()
@@ -103,6 +107,54 @@ def test_lengths_and_flexure_are_unknowns_where_they_are_asked_for() -> None:
     assert value[f"{name} flexure"] == pytest.approx(soft, abs=5.0 * sigma[f"{name} flexure"])
     assert sigma[f"{name} flexure"] < 0.002
     assert abs(value[f"{name} length"]) < 5.0 * sigma[f"{name} length"] < 5.1e-3
+
+
+@pytest.mark.requirement("R-11")
+def test_a_board_on_a_level_table_determines_the_zero_of_a_horizontal_first_joint() -> None:
+    """The mounts take that zero up otherwise; a board that does not lie says nothing about it."""
+    offsets = dict(zip(RIGHT, np.radians((0.15, 0.05, -0.1, 0.1, 0.0, -0.05, 0.0)).tolist(), strict=True))
+    off = {}
+    for lying in (True, False):
+        known = make_session("in_hand", 8, 0.02, zeros=offsets, spread=0.5, lying=lying)
+        views, optics = arm_views([known.samples])
+        for level in (math.radians(0.005), None):
+            config = ZerosConfig(sigma=math.radians(0.1), level=level, solver=LAX)
+            found = solve_zeros(ROBOT, views, optics, config)
+            off[lying, level is not None] = math.degrees(found.values[0] - offsets[RIGHT[0]])
+            assert found.observable[0] == (lying and level is not None)
+    assert abs(off[True, True]) < 0.02
+    assert off[False, True] == off[False, False]
+    assert abs(off[True, False]) > 0.05
+
+
+@pytest.mark.long
+@pytest.mark.requirement("A-40", "R-11")
+@pytest.mark.parametrize("seed", [0, 1])
+def test_mounts_and_hands_are_as_accurate_as_it_says(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """Zeros 0.1° off in both arms, the board in each hand and on the table: what is left is within three deviations."""
+    monkeypatch.setattr(zero_sets, "_FOLDS", 2)
+    rng = np.random.default_rng(100 + seed)
+    zeros = {
+        f"openarm_{arm}_joint{k}": math.radians(0.1) * rng.normal() for arm in ("right", "left") for k in range(1, 8)
+    }
+    sets = (("to_hand", "right"), ("to_hand", "left"), ("in_hand", "right"))
+    known = [
+        make_session(setup, 12, 0.02, seed=seed + 50 * k, zeros=zeros, spread=0.5, arm=arm, lying=setup == "in_hand")
+        for k, (setup, arm) in enumerate(sets)
+    ]
+    found = calibrate_zeros([one.samples for one in known], ZerosConfig(level=math.radians(0.05)))
+    assert not found.failures
+    assert found.verdict("overhead") == ("pass", ())
+    grade, (reason, *_) = found.verdict("wrist")
+    assert (grade, reason[:26]) == ("warn", "accuracy of the rotation 0")
+    for mount, one in zip(found.mounts, (known[0], known[2]), strict=True):
+        offset, angle = mount_error(mount.T_parent_link @ T_LINK_OPTICAL, one.X)
+        assert offset < 3.0 * mount.sigma_translation < 3e-3
+        assert angle < 3.0 * mount.sigma_rotation < math.radians(0.4)
+        assert 1e-4 < found.hand(mount.camera) < 1e-3
+    solution = found.result.solution
+    away = difference(solution.estimate.X[0], known[0].X)
+    assert away @ np.linalg.solve(solution.mount_covariance(), away) < 30.0
 
 
 def test_sessions_of_several_cameras_give_the_views(session) -> None:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.camera.cameras import load_cameras, uncertain_cameras
+from openarm_common.camera.cameras import uncertain_cameras
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import ROBOT, robot_names, robot_work
-from openarm_common.scene.boards import board_of, board_scenes, board_start
+from openarm_common.scene.boards import board_of, board_places, board_scenes, board_start
 from openarm_common.scene.scene import load_scene
 
 
@@ -19,6 +19,8 @@ def test_a_hand_holds_it_before_a_fixed_camera():
     assert (board.name, board.link) == ("board", "openarm_right_link7")
     place = se3.make(se3.rotation_from_z_y((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), (0, 0, 0.37))
     np.testing.assert_allclose(board.T_link_fixture, place, atol=1e-12)
+    (other,) = load_scene("calibration_overhead_left_arm").fixtures
+    assert other.link == "openarm_left_link7"
 
 
 @pytest.mark.long
@@ -35,7 +37,9 @@ def test_it_lies_on_the_table_before_the_camera_of_a_hand(nearer, monkeypatch, r
 @pytest.mark.parametrize("robot", robot_names())
 def test_each_camera_whose_mount_is_not_known_has_a_scene(robot, monkeypatch):
     monkeypatch.setenv(ROBOT, robot)
-    assert {f"calibration_{name}" for name in uncertain_cameras()} == board_scenes().keys() - {"calibration"}
+    places = board_places(uncertain_cameras())
+    assert {place.scene for place in places} == board_scenes().keys() - {"calibration"}
+    assert {f"calibration_{name}" for name in uncertain_cameras()} <= board_scenes().keys()
     for name in board_scenes():
         assert load_scene(name).objects == ()
         assert len(load_scene(name).fixtures) == 1
@@ -47,10 +51,9 @@ def test_a_calibration_begins_with_the_board_above_the_table_and_in_no_wall(robo
     """Home where that will do; in the Cell home would put the board into its side wall."""
     monkeypatch.setenv(ROBOT, robot)
     description = RobotDescription.load()
-    for name in uncertain_cameras():
-        camera = load_cameras()[name]
-        link, T_link_board = board_of(camera, description)
-        start = board_start(camera)
+    for place in board_places(uncertain_cameras()):
+        link, T_link_board = board_of(place.camera, description, place.arm)
+        start = board_start(place)
         arms = {joint for arm in description.arm_names for joint in description.arm_joints(arm)}
         assert not (arms & start.keys() and robot in ("openarm_v1", "openarm_v2", "panda"))
         if not link:
