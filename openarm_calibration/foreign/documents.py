@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from openarm_common.config import parse_json, parse_yaml, read_text
+from openarm_common.config import MAX_YAML_BYTES, parse_json, parse_yaml, read_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 
@@ -71,12 +71,23 @@ def read_document(path: Path) -> Any:
 def _decoded(path: Path) -> str:
     """Return the text of a file in UTF-8, or in what spreadsheets write."""
     try:
-        head = path.read_bytes()[:4]
+        with path.open("rb") as file:
+            head = file.read(MAX_YAML_BYTES)
         if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
             return path.read_text("utf-16")
+        if not _is_utf8(head) and b"\0" not in head:
+            return head.decode("latin-1")
         return read_text(path).removeprefix("\ufeff")
     except (OSError, UnicodeError) as error:
         raise OpenArmError(Code.CONFIG_INVALID, f"can't read {path}: {type(error).__name__}") from error
+
+
+def _is_utf8(content: bytes) -> bool:
+    try:
+        content.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _arrays(path: Path) -> dict[str, Any]:

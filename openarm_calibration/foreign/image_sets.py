@@ -39,6 +39,8 @@ IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _LARGEST = 64 * 2**20
 #: Of settling in which way boards are read.
 _ROUNDS = 4
+#: Corners with numbers that a view needs.
+_FEWEST_CORNERS = 6
 
 
 @dataclass(frozen=True)
@@ -223,7 +225,27 @@ def _look(file: Path, board: Board, lens: Lens) -> list[_View]:
 
 
 def _marks(corners: Array, label: str, board: Board, lens: Lens) -> list[_View]:
-    """Return the board of a list of corners (m, 2) px, in each way in which it can be read; as it is listed first."""
+    """Return the board of a list of corners px, in each way in which it can be read; as it is listed first.
+
+    Args:
+        corners: (m, 2), or (m, 3) with their numbers; NaN beyond those that there are.
+        label: Of the record.
+        board: Whose corners they are.
+        lens: Of the camera.
+    """
+    if corners.shape[1] == 3:
+        seen = corners[np.isfinite(corners).all(axis=1)]
+        ids = seen[:, 0].astype(np.int64)
+        known = set(range(len(board.points)))
+        if len(ids) < _FEWEST_CORNERS or len({*ids.tolist()} & known) < len(ids):
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"{label} has {len(ids)} corners with numbers {ids.min(initial=0)} to {ids.max(initial=0)}; expected"
+                f" {_FEWEST_CORNERS} or more, each once, of 0 to {len(board.points) - 1} ({board.label})",
+            )
+        pixels = lens.undistorted(np.ascontiguousarray(seen[:, 1:]))
+        T, residual = guess_pose(board.points[ids], pixels, board.radius, lens.intrinsics)
+        return [_View(BoardDetection(ids, pixels, residual), T)]
     if len(corners) != len(board.points):
         raise OpenArmError(
             Code.NOTHING_DETECTED, f"{label} has {len(corners)} corners, {board.label} has {len(board.points)}"

@@ -40,7 +40,8 @@ class Column:
 
     Args:
         name: Name in its file.
-        rows: (n, k) numbers of poses, position first; of corners (n, m, 2) px.
+        rows: (n, k) numbers of poses, position first; of corners (n, m, 2) px, or (n, m, 3) with the number of each
+            corner first, NaN beyond those of a record.
         labels: (n,) of the records.
         rotation: Form that the file tells; "" where it does not.
         unit: The same of positions.
@@ -77,11 +78,13 @@ def searched(path: Path, document: Any) -> list[Column]:
     found: dict[tuple[str, int], list[tuple[str, Array, str]]] = {}
     for keys, value, form in _poses(document, ()):
         name, label = _name_of(keys)
-        found.setdefault((name, value.size if value.ndim == 1 else -value.size), []).append((label, value, form))
+        numbered = value.ndim == 2 and value.shape[1] == 3
+        size = value.size if value.ndim == 1 else 0 if numbered else -value.size
+        found.setdefault((name, size), []).append((label, value, form))
     out: list[Column] = []
     for (name, _), entries in found.items():
         forms = {form for _, _, form in entries}
-        rows = np.array([value for _, value, _ in entries])
+        rows = _stacked([value for _, value, _ in entries])
         labels = tuple(label for label, _, _ in entries)
         keys = tuple((re.findall(r"\d+", label) or [label])[-1] for label in labels)
         out.append(Column(name, rows, labels, forms.pop() if len(forms) == 1 else "", keys=keys))
@@ -97,6 +100,13 @@ def searched(path: Path, document: Any) -> list[Column]:
         )
     # what stands once is about the camera, or a result
     return [one for one in out if len(one.rows) > 1]
+
+
+def _stacked(values: list[Array]) -> Array:
+    """Return values as one array; of corners with numbers there may be more in one record than in another."""
+    most = max(len(value) for value in values)
+    return np.array([np.pad(value, ((0, most - len(value)), *((0, 0),) * (value.ndim - 1)), constant_values=np.nan)
+                     for value in values])  # fmt: skip
 
 
 def _name_of(keys: _Keys) -> tuple[str, str]:
@@ -135,12 +145,17 @@ def _poses(value: Any, keys: _Keys) -> Iterator[tuple[_Keys, Array, str]]:
             if not others:
                 return
         yield from _of_pairs(entries, keys)
+        numbered, entries = _numbered(entries)
+        if numbered is not None:
+            yield (*keys, "corners"), numbered, ""
         for key, one in entries.items():
             yield from _poses(one, (*keys, key))
         return
     if not isinstance(value, list | tuple | np.ndarray):
         return
     array = _numbers(value)
+    if array is not None and array.ndim >= 3 and array.shape[-2:] == (1, 2):
+        array = array[..., 0, :]  # OpenCV has a list of one point for each corner
     if array is None:
         for k, one in enumerate(value):  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
             yield from _poses(one, (*keys, k))
@@ -151,6 +166,20 @@ def _poses(value: Any, keys: _Keys) -> Iterator[tuple[_Keys, Array, str]]:
     elif array.ndim >= 2:
         for k, one in enumerate(array):
             yield from _poses(one, (*keys, k))
+
+
+def _numbered(entries: dict[str, Any]) -> tuple[Array | None, dict[str, Any]]:
+    """Return corners with their numbers in a record, (m, 3): number, u, v; and what else the record has."""
+    arrays = {key: array for key, one in entries.items() if (array := _numbers(_plain(one))) is not None}
+    for key, ids in arrays.items():
+        n = ids.size
+        if not re.fullmatch(r"(.*_)?ids?", key.lower()) or n < 2 or (ids != ids.round()).any():
+            continue
+        for other, corners in arrays.items():
+            if other != key and corners.shape in ((n, 2), (n, 1, 2)):
+                rest = {name: one for name, one in entries.items() if name not in (key, other)}
+                return np.column_stack([ids.ravel(), corners.reshape(n, 2)]), rest
+    return None, entries
 
 
 def _is_pose(array: Array) -> bool:

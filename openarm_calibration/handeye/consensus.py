@@ -19,7 +19,7 @@ from openarm_calibration.handeye.closed_form import nearest_rotation
 from openarm_common import se3
 from openarm_common.types import Array
 
-#: Rounds of weights, and those of them that begin anew by the closed form.
+#: Rounds of weights, and those of them that begin again with the closed form.
 ROUNDS, _CLOSED = 20, 3
 #: Angles about one axis that are tried.
 _STEPS = 72
@@ -65,7 +65,7 @@ def agreed(B: Array, C: Array, *, scaled: bool = False, rounds: int = ROUNDS) ->
         B: (n, 4, 4) from the board's to the camera's carrier.
         C: (n, 4, 4) T_camera_board.
         scaled: Whether lengths in C are in a unit of their own.
-        rounds: Number of rounds of weights; a few tell whether poses agree at all.
+        rounds: Number of rounds of weights; a few show whether poses agree at all.
     """
     RB, RC = B[:, :3, :3], C[:, :3, :3]
     shared = _one_axis(RB, RC)
@@ -81,7 +81,7 @@ def agreed(B: Array, C: Array, *, scaled: bool = False, rounds: int = ROUNDS) ->
     def left(angle: float) -> float:
         return turned(angle).spread[0]
 
-    # translations tell the rotation about that axis
+    # translations determine the rotation about that axis
     first = min(np.linspace(0.0, 2.0 * np.pi, _STEPS, endpoint=False), key=left)
     reach = 2.0 * np.pi / _STEPS
     found: Any = minimize_scalar(left, bounds=(first - reach, first + reach), method="bounded", options={"xatol": 1e-4})

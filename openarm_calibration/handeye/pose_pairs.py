@@ -124,7 +124,7 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """A position of the camera along a direction (3,), m, that the pairs do not tell."""
+    """A position of the camera along a direction (3,), m, that the pairs do not determine."""
 
     along: Array
     at: float
@@ -144,7 +144,7 @@ def solve_pairs(pairs: PosePairs, fixed: Mapping[str, float] | None = None) -> P
 
     Args:
         pairs: Pairs of one camera and board.
-        fixed: Position of the camera along an axis of its parent, `x`, `y` or `z`, m, where the pairs do not tell it.
+        fixed: Position of the camera along an axis of its parent, `x`, `y` or `z`, m, where the pairs leave it free.
 
     Raises:
         OpenArmError: DEGENERATE, when the poses do not determine the mounts, with the cause and what to add;
@@ -158,6 +158,9 @@ def solve_pairs(pairs: PosePairs, fixed: Mapping[str, float] | None = None) -> P
     if (fault := motion_fault(seen)) and not seen.one_axis:
         raise OpenArmError(Code.DEGENERATE, fault)
     common = agreed(pairs.B, pairs.C)
+    about_one = bool(common.free.any())
+    if fault and not about_one:  # it turned a little about a second axis: enough to be seen, too little to be used
+        raise OpenArmError(Code.DEGENERATE, fault)
     held, free = _held(common, fixed or {})
     noise = max(common.spread[0], _LEAST[0]), max(common.spread[1], _LEAST[1])
     start = _Fit(common.X, common.Z, np.eye(12), noise)
@@ -176,9 +179,9 @@ def solve_pairs(pairs: PosePairs, fixed: Mapping[str, float] | None = None) -> P
         if _distance(pairs, used, int(k), fit, held) <= _limit(used):
             used[k] = True
             fit = _fit(pairs, used, fit, held)
-    # about one axis, and without a motion across it, the rotation about that axis is not told either
+    # about one axis, and without a motion across it, the rotation about that axis is not determined either
     unsure = math.sqrt(np.trace(fit.covariance[3:6, 3:6])) > _UNSURE
-    if (fault := motion_fault(motion(pairs.A[used]))) and (unsure or not seen.one_axis):
+    if (fault := motion_fault(motion(pairs.A[used]))) and (unsure or not about_one):
         raise OpenArmError(Code.DEGENERATE, fault)
     distance = np.mean((residuals(pairs, fit.X, fit.Z) / _sigmas(fit)) ** 2, axis=1)
     inside = pairs.subset(used)
@@ -200,7 +203,7 @@ def _held(common: Consensus, fixed: Mapping[str, float]) -> tuple[_Held | None, 
         if fixed:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,
-                f"--fix {next(iter(fixed))}: the poses turn about two axes and tell all six numbers",
+                f"--fix {next(iter(fixed))}: the poses turn about two axes and determine all six numbers",
             )
         return None, common.free
     if not fixed:
@@ -210,7 +213,7 @@ def _held(common: Consensus, fixed: Mapping[str, float]) -> tuple[_Held | None, 
     if abs(float(along @ common.free)) < _ALONG or len(fixed) > 1:
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
-            f"--fix {' '.join(fixed)}: what the poses do not tell is the camera's place along its parent's"
+            f"--fix {' '.join(fixed)}: what the poses do not determine is the camera's place along its parent's"
             f" {axis_name(common.free)}; give that one, m",
         )
     return _Held(along, at), np.zeros(3)

@@ -142,7 +142,7 @@ def test_an_arm_of_four_axes_tells_five_numbers_of_the_mount_and_takes_the_sixth
     for fixed, words in (({"x": 0.1}, "along its parent's z axis"), ({"y": 0.1, "z": 0.1}, "give that one")):
         with refuses(Code.INVALID_ARGUMENT, words):
             solve_pairs(known.pairs, fixed)
-    with refuses(Code.INVALID_ARGUMENT, "tell all six numbers"):
+    with refuses(Code.INVALID_ARGUMENT, "determine all six numbers"):
         solve_pairs(files.truth(setup).pairs, {"z": 0.1})
 
 

@@ -266,6 +266,49 @@ def test_corners_without_pictures_come_with_the_poses(tmp_path: Path) -> None:
     assert poses(source.robot) == pytest.approx(A)
 
 
+@pytest.mark.parametrize("name", ["views.json", "views.yml"])
+@pytest.mark.requirement("A-45")
+def test_corners_with_numbers_are_those_of_the_board_that_are_seen(tmp_path: Path, name: str) -> None:
+    """As ChArUco's detection gives them: other ones and another count in each record, also as OpenCV writes them."""
+    known, board = files.truth("in_hand", 11, seed=3), read_board("charuco:7x5:34mm:26mm:DICT_6X6_250")
+    row, rng = np.array([files.K.fx, files.K.fy, files.K.cx, files.K.cy]), np.random.default_rng(1)
+    seen = [rng.permutation(len(board.points))[: rng.integers(6, 20)] for _ in known.A]
+    pixels = [project(board.points[ids], 0.0, c, row) for ids, c in zip(seen, known.C, strict=True)]
+    path = tmp_path / name
+    if path.suffix == ".json":
+        views = zip(known.A, seen, pixels, strict=True)
+        path.write_text(
+            json.dumps([{"ids": i.tolist(), "corners": p.tolist(), "T_base_hand": a.tolist()} for a, i, p in views])
+        )
+    else:
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        for k, (a, ids, at) in enumerate(zip(known.A, seen, pixels, strict=True)):
+            file.startWriteStruct(f"view_{k}", cv2.FILE_NODE_MAP)
+            file.write("charuco_ids", ids[:, None].astype(np.int32))
+            file.write("charuco_corners", at[:, None].astype(np.float32))
+            file.write("T_base_hand", a)
+            file.endWriteStruct()
+        file.release()
+    source = read_source(path)
+    robot = Poses(source.robot.rows, ROBOT_FRAMES, names=source.robot.labels)
+    found = image_set(source, None, board, Lens(files.K), robot, "in_hand", Names())
+    assert [len(sample.detection.ids) for sample in found.samples.samples] == [len(ids) for ids in seen]
+    assert mount_error(solve(found.samples.problem()).estimate.X[0], known.X)[0] < 1e-4
+    with refuses(Code.DEGENERATE, "each once, of 0 to 5"):
+        image_set(source, None, read_board("charuco:4x3:34mm:26mm:DICT_6X6_250"), Lens(files.K), robot, "in_hand",
+                  Names())  # fmt: skip
+
+
+def test_a_table_in_latin_1_is_read(tmp_path: Path) -> None:
+    rows = [
+        ",".join(map(str, [f"Gr\u00f6\u00dfe {k}", *files.numbers(A[k : k + 1], "xyzw")[0]])) for k in range(len(A))
+    ]
+    (tmp_path / "a.csv").write_bytes("\n".join(rows).encode("latin-1"))
+    source = read_source(tmp_path / "a.csv")
+    assert source.images[0] == "Gr\u00f6\u00dfe 0"
+    assert len(source.robot.rows) == len(A)
+
+
 @pytest.mark.parametrize("spelling", ["chessboard:4x3:40mm", "chessboard:5x3:30mm", "symmetric_circles:5x4:30mm:12mm"])
 def test_lists_of_corners_that_begin_at_either_end_are_read_alike(tmp_path: Path, spelling: str) -> None:
     """By rows or by columns, and turned by half in four of eleven views; the poses of the robot tell."""
