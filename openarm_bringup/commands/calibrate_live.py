@@ -37,6 +37,8 @@ def auto(
     store: Path | None = None,
     delay: bool = False,
     running: bool = False,
+    carrier: str = "",
+    session: Path | None = None,
     domain: Domain = None,
     set_: Sets = (),
     robot: Robot = None,
@@ -55,6 +57,8 @@ def auto(
         store: Folder of stored calibrations.
         delay: Also measure how old images are at their stamps.
         running: Use the graph that runs, with the board in place, instead of a simulated one; of one camera.
+        carrier: With --running: link that holds the board of a fixed camera; the last arm's flange when not given.
+        session: With --running: file (.npz) to write the samples to, for `openarm calibrate zeros`.
         domain: ROS_DOMAIN_ID; a free one, or that of the running graph, when not given.
     """
     choose_robot(robot)
@@ -70,19 +74,23 @@ def auto(
         seed = int(mount_seed)
     if store is not None:
         store_in(store)
+    if not running and (carrier or session is not None):
+        raise OpenArmError(Code.INVALID_ARGUMENT, "--carrier and --session are for --running; else each arm holds it")
+    if session is not None and session.suffix != ".npz":
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--session {session}: expected a name that ends in .npz")
     show = _Show()
     options = CalibrationOptions(
         uncertain_cameras() if camera == "all" else (camera,), mount_seed=seed, poses=poses, save=save,
         zeros=camera == "all", store=store, delay=delay, domain=domain, sets=tuple(set_),
     )  # fmt: skip
     if running:
-        return _running(options, show)
+        return _running(options, show, carrier, session)
     run = run_calibration(options, CalibrationListeners(show.event, show.ready, show.camera, show.feedback))
     if run.found is not None:
         _pages_of(run.found, run.sessions)
     else:
-        for session in run.sessions:
-            _page(session, session.with_suffix(".html"), store)
+        for samples in run.sessions:
+            _page(samples, samples.with_suffix(".html"), store)
     return _outcome(run)
 
 
@@ -203,7 +211,7 @@ def _servo_lines(record: StoredServos) -> list[str]:
     return lines
 
 
-def _running(options: CalibrationOptions, show: _Show) -> Outcome:
+def _running(options: CalibrationOptions, show: _Show, carrier: str, session: Path | None) -> Outcome:
     camera, *others = options.cameras
     if others:
         raise OpenArmError(
@@ -217,7 +225,10 @@ def _running(options: CalibrationOptions, show: _Show) -> Outcome:
     stop = threading.Event()
     with requires_node("calibration", "calibrate"), CalibrationClient() as client:
         try:
-            result = client.auto(camera, **options.goal, on_feedback=show.feedback, stop=stop)
+            file = "" if session is None else str(session.expanduser().absolute())
+            result = client.auto(
+                camera, carrier=carrier, session=file, **options.goal, on_feedback=show.feedback, stop=stop
+            )
         except KeyboardInterrupt:
             return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED)
     return _outcome(CalibrationRun(None, {camera: result}))
