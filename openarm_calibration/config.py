@@ -51,6 +51,9 @@ class AutoConfig(Config):
     velocity_scale: float = Field(default=0.5, gt=0.0, le=1.0, description="of the motions")
     delay_velocity_scale: float = Field(default=0.1, gt=0.0, le=1.0, description="while the delay is measured")
     settle_timeout: float = Field(default=5.0, gt=0.0, description="longest wait until the arm is at rest, s")
+    camera_timeout: float = Field(
+        default=30.0, gt=0.0, description="longest wait for images, as of a driver that starts again, s of wall clock"
+    )
     move_timeout: float = Field(default=60.0, gt=0.0, description="longest wait for a motion, s of wall clock")
     plate: float = Field(default=0.01, gt=0.0, description="thickness that plans allow for the board, m")
     on_table: PlaceConfig = Field(default_factory=PlaceConfig, description="board of a camera that moves, base frame")

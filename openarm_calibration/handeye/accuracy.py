@@ -10,7 +10,7 @@ that zeros may have, each weighed by its evidence; of a solve of zeros they foll
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -47,13 +47,13 @@ class Accuracy:
         translation: Deviation of the mount's position, m.
         rotation: Deviation of its rotation, rad.
         hand: Distance of the tool centre point from where the camera sees it, rms, m.
-        zeros: Deviation of a joint's zero, rad.
+        zeros: Deviation of each joint's zero, rad.
     """
 
     translation: float
     rotation: float
     hand: float
-    zeros: float
+    zeros: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ def accuracy_of(samples: SampleSet, solution: Solution) -> Accuracy:
         for weight, answer in zip(weights, answers, strict=True)
         if weight >= _UNLIKELY
     ]
-    return _averaged(samples, now.X[0], np.zeros(part.joints), truths, math.sqrt(float(weights @ scales**2)))
+    return _averaged(samples, now.X[0], np.zeros(part.joints), truths)
 
 
 def accuracies(sessions: Sequence[SampleSet], result: ZerosResult) -> tuple[Accuracy, ...]:
@@ -125,22 +125,20 @@ def accuracies(sessions: Sequence[SampleSet], result: ZerosResult) -> tuple[Accu
         both = np.r_[6 * camera : 6 * camera + 6, first + np.array(mine)]
         X, zeros = estimate.X[camera], estimate.zeros[mine]
         spread = covariance[np.ix_(both, both)]
-        off = math.sqrt(float(np.mean(np.diag(spread)[6:])))
-        described = samples.with_zeros({})
-        out.append(_averaged(described, X, zeros, [Truth(1.0, X, zeros, spread)], off))
+        out.append(_averaged(samples.with_zeros({}), X, zeros, [Truth(1.0, X, zeros, spread)]))
     return tuple(out)
 
 
-def _averaged(samples: SampleSet, X: Array, zeros: Array, truths: Sequence[Truth], off: float) -> Accuracy:
+def _averaged(samples: SampleSet, X: Array, zeros: Array, truths: Sequence[Truth]) -> Accuracy:
     """Return the accuracy of a mount (4, 4) and zeros (joints,) in use, averaged over what may be true."""
     hand = _Hand.of(samples, X, zeros)
-    mount, miss = np.zeros((6, 6)), 0.0
+    variance, miss = np.zeros(6 + len(zeros)), 0.0
     for truth in truths:
-        away = difference(X, truth.X)
-        mount += truth.weight * (truth.covariance[:6, :6] + np.outer(away, away))
+        away = np.concatenate([difference(X, truth.X), truth.zeros - zeros])
+        variance += truth.weight * (np.diag(truth.covariance) + away**2)
         miss += truth.weight * hand.square(truth)
-    variance = np.diag(mount)
-    return Accuracy(math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum()), math.sqrt(miss), off)
+    off = dict(zip(samples.joint_names, np.sqrt(variance[6:]).tolist(), strict=True))
+    return Accuracy(math.sqrt(variance[:3].sum()), math.sqrt(variance[3:6].sum()), math.sqrt(miss), off)
 
 
 @dataclass(frozen=True, eq=False)

@@ -143,8 +143,9 @@ def assess(
     because = ""
     if by_zeros is not None:
         figures |= {"hand": by_zeros.hand, "zeros_sigma": by_zeros.zeros}
+        least = max(by_zeros.zeros, key=by_zeros.zeros.__getitem__)
         if max(true_t / sigma_t, true_r / sigma_r) > 2.0:
-            because = f", as zeros of the joints are known to {math.degrees(by_zeros.zeros):.2f}°"
+            because = f", as the zero of {least} is known to {math.degrees(by_zeros.zeros[least]):.2f}°"
     outliers, views = len(solution.outliers), len(problem)
     arm = solution.estimate.noise
     spread = "wrong joint zeros; find them by `openarm calibrate zeros`" if problem.joints else _OF_POSES

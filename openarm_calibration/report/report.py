@@ -54,8 +54,8 @@ def _by_zeros(figures: dict[str, Any]) -> str:
     """Return what zeros of the joints that may be off do to mount and hand, in words; "" where joints are not known."""
     if "hand" not in figures:
         return ""
-    zeros, hand = math.degrees(figures["zeros_sigma"]), figures["hand"] * 1e3
-    return f" (zeros of joints ± {zeros:.3f}°); the hand meets what the camera sees to {hand:.3f} mm"
+    zeros, hand = math.degrees(max(figures["zeros_sigma"].values())), figures["hand"] * 1e3
+    return f" (zeros of joints ± {zeros:.3f}° at most); the hand meets what the camera sees to {hand:.3f} mm"
 
 
 def zeros_page(found: ZerosCalibration) -> str:

@@ -193,14 +193,15 @@ class _Run:
         raise OpenArmError(Code.NO_PLAN, f"the arm reaches none of {tried} poses; of the last: {last}")
 
     async def _take(self) -> Sample:
-        """Take a sample as soon as the arm is at rest."""
-        until = time.monotonic() + self._config.settle_timeout
+        """Take a sample as soon as the arm is at rest and images come."""
+        began = time.monotonic()
+        longest = {Code.MOVING: self._config.settle_timeout, Code.NOT_READY: self._config.camera_timeout}
         while True:
             self._check()
             try:
                 return await self._node.take()
             except OpenArmError as error:
-                if error.code != Code.MOVING or time.monotonic() > until:
+                if time.monotonic() > began + longest.get(error.code, 0.0):
                     raise
 
     def _miss(self, q: Array, error: OpenArmError) -> None:

@@ -33,6 +33,7 @@ from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import load_folder, robot_name
 from openarm_common.types import Array
 
 #: Marks nearer to the edge of the image do not count as seen, px.
@@ -90,6 +91,8 @@ def advice(A: Sequence[Array] | Array) -> str:
 _RULER = 45.0
 #: Postures drawn over the whole range to find a first one.
 _FIRST_DRAWS = 20_000
+#: A board in the hand keeps this from the table, m: arms that give way to gravity stop lower than they were sent to.
+_CLEAR = 0.03
 #: Drawn at once.
 _BATCH = 250
 #: Of postures that are about equally informative the nearest is taken.
@@ -161,6 +164,8 @@ class PoseSearch:
         self._config = config or SearchConfig()
         self._rng = np.random.default_rng(self._config.seed)
         self._bodies = Bodies(description)
+        work = load_folder(robot_name())[1].work
+        self._table = None if work is None else work.table
         self._known: list[Array] = []
         self._refused: list[Array] = []
         self._widths: list[float] = []
@@ -278,7 +283,7 @@ class PoseSearch:
                     continue
                 links = self._description.link_poses({**state, **_joints(samples, q)})
                 shapes = self._bodies.place(links)
-                if self._bodies.touching(shapes):
+                if self._bodies.touching(shapes) or self._sinks(samples, links, Z, plate):
                     continue
                 eye = links[samples.head.parent] @ self.belief.X
                 if self._bodies.hidden(shapes, eye[:3, 3], se3.apply(eye @ T, plate)):
@@ -289,6 +294,15 @@ class PoseSearch:
                 if len(out) == wanted:
                     break
         return out, shadowed
+
+    def _sinks(self, samples: SampleSet, links: Mapping[str, Array], Z: Array, plate: Array) -> bool:
+        """Return whether a board in the hand, of points (n, 3), is too near to the table."""
+        if self._table is None or samples.head.setup != "to_hand":
+            return False
+        points = se3.apply(links[samples.head.carrier] @ Z, plate)
+        (x, y), edges = points[:, :2].T, (*self._table.x, *self._table.y)
+        over = (x > edges[0] - _CLEAR) & (x < edges[1] + _CLEAR) & (y > edges[2] - _CLEAR) & (y < edges[3] + _CLEAR)
+        return bool((points[over, 2] < self._table.top_z + _CLEAR).any())
 
     def _views(self, samples: SampleSet, q: Array, Z: Array) -> Array:
         """Return T_camera_board (n, 4, 4) at postures (n, joints)."""

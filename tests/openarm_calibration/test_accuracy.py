@@ -50,6 +50,7 @@ def test_predicted_errors_are_those_of_repetitions(setup, rms: float) -> None:
         X = solution.estimate.X[0]
         found, (t, r) = accuracy_of(known.samples, solution), mount_error(X, known.X)
         hand = missed(known, X, known.description, offsets)
-        squares.append([(t / found.translation) ** 2, (r / found.rotation) ** 2, (hand / found.hand) ** 2])
-    assert (np.mean(squares, axis=0) > 0.1).all()
+        zeros = np.mean([(offsets[name] / deviation) ** 2 for name, deviation in found.zeros.items()])
+        squares.append([(t / found.translation) ** 2, (r / found.rotation) ** 2, (hand / found.hand) ** 2, zeros])
+    assert (np.mean(squares, axis=0)[: 4 if rms else 3] > 0.1).all()
     assert (np.mean(squares, axis=0) < 2.5).all()

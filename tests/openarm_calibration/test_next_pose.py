@@ -20,6 +20,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import robot_work
 from openarm_common.scene.scene import load_scene
 from tests.refusals import refuses
 
@@ -117,6 +118,17 @@ def test_what_was_refused_is_not_proposed_again() -> None:
         search.refuse(proposal)
     again = search.propose(arm.samples, arm.state)
     assert all(np.abs(a - b).max() > 0.05 for a in again for b in first)
+
+
+def test_a_board_in_the_hand_is_not_sent_close_to_the_table() -> None:
+    """Arms that give way to gravity would lay it on the table, where no motion begins."""
+    arm, table = Arm("overhead"), robot_work().table
+    corners = np.array([[x, y, 0.0] for x in (-0.09, 0.09) for y in (-0.12, 0.12)])
+    for proposal in arm.search().propose(arm.samples, arm.state, 50):
+        joints = arm.state | dict(zip(arm.samples.joint_names, proposal.tolist(), strict=True))
+        board = se3.apply(arm.description.link_pose(HAND, joints) @ arm.Z, corners)
+        over = (board[:, 0] > table.x[0]) & (np.abs(board[:, 1]) < table.y[1])
+        assert (board[over, 2] > table.top_z + 0.015).all()  # the ruler was 10 mm off
 
 
 def test_no_board_and_a_board_that_can_not_be_seen_are_refused_with_what_to_do() -> None:

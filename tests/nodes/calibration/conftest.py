@@ -31,7 +31,7 @@ class PosedRobot:
         self.speed = 0.0  # of joint 1, rad/s
         self.images = True
         self.blank = False
-        self._t = 10_000 * MS
+        self.time_ns = 10_000 * MS
         first = known.samples.samples[0]
         A = known.samples.pose(first.joints)
         in_hand = known.samples.head.setup == "in_hand"
@@ -60,14 +60,14 @@ class PosedRobot:
 
     def _tick(self) -> None:
         for _ in range(5):
-            self._t += 10 * MS
+            self.time_ns += 10 * MS
             message = JointState(name=list(self.joints), position=list(self.joints.values()))
-            message.position[0] += self.speed * (self._t - 10_000 * MS) * 1e-9
-            message.header.stamp = ns_to_stamp(self._t)
+            message.position[0] += self.speed * (self.time_ns - 10_000 * MS) * 1e-9
+            message.header.stamp = ns_to_stamp(self.time_ns)
             self._joints.publish(message)
         if self.images:
             frame = f"{self.camera}_color_optical_frame"
-            t = self._t + self.offset_ns
+            t = self.time_ns + self.offset_ns
             pixels = np.full_like(self._pixels, 128) if self.blank else self._pixels
             self._info.publish(info_from_intrinsics(self.known.samples.head.optics, frame, t))
             self._image.publish(array_to_image(pixels, "rgb8", frame, t))

@@ -162,6 +162,20 @@ def test_cancel_stops_the_motion_and_the_node_is_free_again(ros, posed_robot, tm
     assert ros.call(ros.node.create_client(TakeSample, "/calibration/take_sample"), TakeSample.Request()).success
 
 
+def test_goes_on_when_images_stop_for_a_while(ros, posed_robot, tmp_path: Path) -> None:
+    """As when a camera's driver is started again: some attempts end without an image before they come back."""
+    quick = {"image_timeout": 0.05, "state_timeout": 0.05}
+    bench = Bench(ros, posed_robot, tmp_path, "to_hand", given_pose=False, **quick)
+    bench.robot.images = False
+    _, ended = bench.start(poses=4)
+    ros.spin_until(lambda: bool(bench.feedback), what="the first attempt")
+    silent = bench.robot.time_ns
+    ros.spin_until(lambda: bench.robot.time_ns > silent + 5e9, what="two seconds without an image")
+    assert not ended.done()
+    bench.robot.images = True
+    assert ros.result(ended, 60.0).result.samples == 4
+
+
 @pytest.mark.long
 def test_says_why_it_can_not(ros, posed_robot, tmp_path: Path) -> None:
     """No board in view and no pose given; a camera that there is not; an arm that is lost; nothing but collisions."""
