@@ -19,12 +19,12 @@ from std_srvs.srv import Trigger
 
 from openarm_bringup.supervision.graph import Ready
 from openarm_bringup.supervision.ros.readiness import ReadinessClient
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.ros.convert import ns_to_stamp
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import Step
 from tests.conftest import DEADLINE_S
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 LATCHED = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -127,8 +127,7 @@ def test_observer_keeps_tracks_states_and_resets_the_world(ros) -> None:
             assert all(a.t_ns < b.t_ns for a, b in itertools.pairwise(track))
             assert (steps[0].state, steps[0].reason) == ("IDLE", "waiting")
             assert observer.reset_world("random", 3) >= track[-1].t_ns
-            with refuses(Code.SCENE_INVALID, "refused: no such scene"):
-                observer.reset_world("nowhere", 0)
+            assert refused("refused: no such scene", observer.reset_world, "nowhere", 0).code is Code.SCENE_INVALID
             observer.forget()
             assert observer.steps() == []
             now_ns = observer.truth().t_ns
@@ -138,8 +137,7 @@ def test_observer_keeps_tracks_states_and_resets_the_world(ros) -> None:
                 world.status.publish(status)
             observer.wait(lambda: observer.steps() or None, DEADLINE_S, "a state")
             assert [step.state for step in observer.steps()] == ["DETECT"]
-            with pytest.raises(OpenArmError, match=r"a unicorn was not there within 0.2 s"):
-                observer.wait(lambda: None, 0.2, "a unicorn")
+            refused(r"a unicorn was not there within 0.2 s", observer.wait, lambda: None, 0.2, "a unicorn")
     finally:
         done.set()
         spinner.join()

@@ -9,10 +9,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from openarm_common.camera.cameras import load_cameras
-from openarm_common.errors import OpenArmError
 from openarm_common.ros.convert import array_to_image, info_from_intrinsics, points_from_cloud, stamp_to_ns
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_perception.ros.cloud_node import CloudNode
+from tests.refusals import refused
 
 CAMERAS = load_cameras()
 OVERHEAD = CAMERAS["overhead"]
@@ -122,8 +122,7 @@ def test_colour_comes_with_the_points_when_asked_for(ros) -> None:
     "params", [{"filter.voxel": 0.01}, {"filter.outliers": True}, {"color": True, "organised": False}]
 )
 def test_what_takes_points_away_is_not_organised(ros, params) -> None:
-    with pytest.raises(OpenArmError, match=r"set organised to (false as well .--set cloud|true, or color)"):
-        ros.start(CloudNode, **params)
+    refused(r"set organised to (false as well .--set cloud|true, or color)", ros.start, CloudNode, **params)
 
 
 @pytest.mark.requirement("A-58")
@@ -161,5 +160,4 @@ def test_what_does_not_fit_is_named_and_dropped(ros) -> None:
 
 def test_an_unknown_camera_is_named(ros) -> None:
     """With those that there are."""
-    with pytest.raises(OpenArmError, match="'rear' is unknown or has no depth; cameras: overhead, wrist"):
-        ros.start(CloudNode, cameras=["rear"])
+    refused("'rear' is unknown or has no depth; cameras: overhead, wrist", ros.start, CloudNode, cameras=["rear"])

@@ -21,6 +21,7 @@ from openarm_bringup.supervision import runs, session
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.campaign.options import parse_seeds
 from tests.openarm_bringup.commands import answer_of, record_of
+from tests.refusals import refused
 
 ROOT = Path(__file__).parents[2]
 
@@ -181,8 +182,7 @@ def test_ps_and_logs_find_a_running_graph(capsys: pytest.CaptureFixture[str]) ->
     assert cli.run(["logs", "leg"]) == 2
     assert "it has arm" in capsys.readouterr().err
     assert runs.the_running().domain == 5
-    with pytest.raises(OpenArmError, match=r"no graph is running in domain 6; running: toy in domain 5"):
-        runs.the_running(6)
+    refused(r"no graph is running in domain 6; running: toy in domain 5", runs.the_running, 6)
 
 
 def test_several_graphs_are_distinguished_by_domain_and_one_that_lost_a_node_is_degraded(
@@ -202,8 +202,7 @@ def test_several_graphs_are_distinguished_by_domain_and_one_that_lost_a_node_is_
         text = capsys.readouterr().out
         assert "part_5: degraded, without eye_5, robot openarm_v1, domain 5" in text
         assert "part_7: ready, robot openarm_v1, domain 7" in text
-        with pytest.raises(OpenArmError, match=r"several graphs are running: part_5 in domain 5 .* choose one"):
-            runs.the_running()
+        refused(r"several graphs are running: part_5 in domain 5 .* choose one", runs.the_running)
         assert runs.the_running(5).graph == "part_5"
         first = runs.the_running(5)
         runs.write_record(first.model_copy(update={"pid": os.getpid(), "pid_created": psutil.Process().create_time()}))
@@ -253,9 +252,7 @@ def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("text", ["", "-3", "3-", "a", "3-1", "1,,2", "1.5"])
 def test_wrong_seeds_are_refused(text: str) -> None:
-    with pytest.raises(OpenArmError) as caught:
-        parse_seeds(text)
-    assert caught.value.code == Code.INVALID_ARGUMENT
+    assert refused(None, parse_seeds, text).code is Code.INVALID_ARGUMENT
 
 
 def test_files_of_tests_that_wait_are_spread_among_those_that_compute() -> None:

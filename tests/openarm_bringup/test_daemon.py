@@ -21,7 +21,8 @@ from openarm_bringup import cli
 from openarm_bringup.daemon import client
 from openarm_bringup.daemon.protocol import LONGEST, build, is_answered
 from openarm_bringup.supervision.state import is_private, socket_path, state_dir
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
+from tests.refusals import refused
 
 pytestmark = pytest.mark.requirement("R-26")
 ROOT = Path(__file__).parents[2]
@@ -195,9 +196,7 @@ def test_a_daemon_that_ends_during_a_command_is_an_error(
     answers: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     answers(["out", "half"])
-    with pytest.raises(OpenArmError, match="ended while it ran this") as error:
-        client.ask(["service", "call", "/pause"])
-    assert error.value.code == Code.INTERNAL
+    assert refused("ended while it ran this", client.ask, ["service", "call", "/pause"]).code is Code.INTERNAL
     capsys.readouterr()
     monkeypatch.setattr(sys, "argv", ["openarm", "service", "call", "/pause", "--json"])
     with pytest.raises(SystemExit, match="1"):

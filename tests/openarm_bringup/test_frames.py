@@ -15,7 +15,7 @@ from tf2_msgs.msg import TFMessage
 from openarm_bringup.commands import tf
 from openarm_bringup.ros.peer import Frames
 from openarm_bringup.view.tree_picture import Row, write
-from openarm_common.errors import OpenArmError
+from tests.refusals import refused
 
 SVG = "{http://www.w3.org/2000/svg}"
 ROWS = (Row(0, "world", True), Row(1, "base", True), Row(2, "arm", False), Row(1, "table <1>", True))
@@ -76,10 +76,8 @@ def test_every_frame_is_drawn_below_and_right_of_its_parent(tmp_path: Path) -> N
 
 
 def test_a_picture_that_cannot_be_written_says_why(tmp_path: Path) -> None:
-    with pytest.raises(OpenArmError, match=r"ends in \.png, \.svg or \.pdf"):
-        write(ROWS, tmp_path / "tree.gif")
-    with pytest.raises(OpenArmError, match=r"can't write .*No such file"):
-        write(ROWS, tmp_path / "none" / "tree.png")
+    refused(r"ends in \.png, \.svg or \.pdf", write, ROWS, tmp_path / "tree.gif")
+    refused(r"can't write .*No such file", write, ROWS, tmp_path / "none" / "tree.png")
 
 
 def test_what_is_wrong_with_many_frames_is_said_once() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics, load_cameras, true_mount
-from openarm_common.errors import OpenArmError
+from tests.refusals import refused
 
 
 @pytest.mark.requirement("A-27", "A-30")
@@ -78,8 +78,7 @@ def test_two_cameras_of_one_name_are_refused(tmp_path) -> None:
     )
     path = tmp_path / "cameras.yaml"
     path.write_text(text)
-    with pytest.raises(OpenArmError, match="unique"):
-        load_cameras(path)
+    refused("unique", load_cameras, path)
 
 
 PAIR = """
@@ -115,5 +114,4 @@ def test_a_pair_that_is_not_side_by_side_is_refused(tmp_path, old: str, new: str
     path = tmp_path / "cameras.yaml"
     assert old in PAIR
     path.write_text(PAIR.replace(old, new))
-    with pytest.raises(OpenArmError, match=said):
-        load_cameras(path)
+    refused(said, load_cameras, path)

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from openarm_common.config import MAX_YAML_BYTES, Config, load_config, load_yaml, parse_yaml
 from openarm_common.errors import Code, OpenArmError
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 
 class _Example(Config):
@@ -42,8 +42,7 @@ def test_every_fault_is_named_with_file_key_and_value(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("text", "part"), [("[1, 2]", "holds a list"), ("a: [", "not valid YAML")])
 def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str, part: str) -> None:
-    with pytest.raises(OpenArmError, match=part):
-        _load(tmp_path, text)
+    refused(part, _load, tmp_path, text)
 
 
 _LAUGHS = "a: &a [x, x]\n" + "".join(f"{k}: &{k} [*{p}, *{p}]\n" for p, k in itertools.pairwise("abcdefghijklmnop"))
@@ -79,9 +78,8 @@ def test_any_text_is_yaml_or_refused(text: str) -> None:
 
 
 def test_a_value_that_does_not_fit_is_quoted_in_brief(tmp_path: Path) -> None:
-    with pytest.raises(OpenArmError) as caught:
-        _load(tmp_path, f"rate: {'x' * 10_000}\nname: 0x{'f' * 10_000}")
-    assert len(caught.value.message) < 500
+    error = refused(None, _load, tmp_path, f"rate: {'x' * 10_000}\nname: 0x{'f' * 10_000}")
+    assert len(error.message) < 500
 
 
 def test_what_is_no_file_of_text_is_refused(tmp_path: Path) -> None:
@@ -91,10 +89,8 @@ def test_what_is_no_file_of_text_is_refused(tmp_path: Path) -> None:
         (tmp_path / "latin.yaml", "is no text in UTF-8: byte 3 is 0xff"),
         (Path("/dev/zero"), "longer than"),
     ):
-        with pytest.raises(OpenArmError, match=part):
-            load_yaml(path)
+        refused(part, load_yaml, path)
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(OpenArmError, match="does not exist"):
-        load_config(tmp_path / "none.yaml", _Example)
+    refused("does not exist", load_config, tmp_path / "none.yaml", _Example)

@@ -4,15 +4,14 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sensor_msgs.msg import PointField
 
 from openarm_common import se3
-from openarm_common.errors import OpenArmError
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.ros.labelled_clouds import labelled_cloud_from_msg, labelled_cloud_to_msg
+from tests.refusals import refused
 
 LABELS = st.lists(st.integers(0, 2**32 - 1), max_size=50)
 
@@ -46,12 +45,10 @@ def test_points_that_are_not_finite_are_left_out() -> None:
 def test_another_layout_is_refused() -> None:
     message = labelled_cloud_to_msg(cloud([1, 2]), "eye", 0)
     message.fields[3].datatype = PointField.FLOAT32
-    with pytest.raises(OpenArmError, match="expected float32 x, y, z and uint32 label"):
-        labelled_cloud_from_msg(message)
+    refused("expected float32 x, y, z and uint32 label", labelled_cloud_from_msg, message)
     message = labelled_cloud_to_msg(cloud([1, 2]), "eye", 0)
     message.width = 3
-    with pytest.raises(OpenArmError, match="32 bytes for 3 points"):
-        labelled_cloud_from_msg(message)
+    refused("32 bytes for 3 points", labelled_cloud_from_msg, message)
 
 
 def test_the_camera_moves_with_the_points() -> None:

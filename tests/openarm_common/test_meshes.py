@@ -16,6 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot import folder
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.meshes import is_convex, mesh_file
+from tests.refusals import refused
 
 ROBOT = """<robot name="r"><link name="a">
   <visual name="seen"><geometry><mesh filename="{visual}"/></geometry></visual>
@@ -81,10 +82,9 @@ def test_packages_are_found_in_prefixes_and_in_the_tree_of_an_installed_package(
     urdf = robot(tmp_path, "package://parts/sub/m.stl", visual="package://nobody/m.stl")
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path / 'none'}:{tmp_path / 'prefix'}")
     wanted = tmp_path / "prefix" / "share" / "parts" / "sub" / "m.stl"
-    with pytest.raises(OpenArmError, match=r"there is no mesh 'package://parts/sub/m\.stl'; tried ") as caught:
-        RobotDescription.from_files(urdf)
-    assert caught.value.code is Code.CONFIG_INVALID
-    assert str(wanted) in caught.value.message
+    error = refused(r"there is no mesh 'package://parts/sub/m\.stl'; tried ", RobotDescription.from_files, urdf)
+    assert error.code is Code.CONFIG_INVALID
+    assert str(wanted) in error.message
     write_stl(wanted, WEDGE, FACES)
     text = RobotDescription.from_files(urdf).urdf
     assert f"file://{wanted}" in text
@@ -97,10 +97,8 @@ def test_packages_are_found_in_prefixes_and_in_the_tree_of_an_installed_package(
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(OpenArmError, match=r"there is no mesh .*/m\.stl"):
-        RobotDescription.from_files(robot(tmp_path))
-    with pytest.raises(OpenArmError, match="there is no file"):
-        RobotDescription.from_files(tmp_path / "none.urdf")
+    refused(r"there is no mesh .*/m\.stl", RobotDescription.from_files, robot(tmp_path))
+    refused("there is no file", RobotDescription.from_files, tmp_path / "none.urdf")
 
 
 @pytest.fixture
@@ -129,5 +127,4 @@ def test_a_folder_names_a_urdf_whose_meshes_are_beside_it(parts, tmp_path):
 @pytest.mark.parametrize(("given", "words"), [({"xacro": "r.urdf.xacro"}, "got both"), ({"urdf": ""}, "got neither")])
 def test_a_folder_has_one_source(parts, tmp_path, given, words):
     (tmp_path / "robots" / "mine" / "robot.yaml").write_text(yaml.safe_dump({**parts, **given}))
-    with pytest.raises(OpenArmError, match=f"expected one of xacro and urdf, {words}"):
-        RobotDescription.from_folder("mine")
+    refused(f"expected one of xacro and urdf, {words}", RobotDescription.from_folder, "mine")

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from openarm_common.errors import OpenArmError
 from openarm_common.motors import frames
 from openarm_common.motors.bus import is_error, pack, unpack
 from openarm_common.motors.frames import Feedback, MitCommand, MotorType, PosForceCommand
+from tests.refusals import refused
 
 #: As in the motors' data sheets: ±rad, ±rad/s, ±N m.
 TYPES = {
@@ -147,14 +147,10 @@ def test_what_is_no_number_is_refused(value: float) -> None:
     kind = frames.motor_type("DM4310")
     for at in range(5):
         command = MitCommand(*(value if k == at else 0.0 for k in range(5)))
-        with pytest.raises(OpenArmError, match="expected a number"):
-            frames.encode_mit(kind, command)
-    with pytest.raises(OpenArmError, match="expected a number"):
-        frames.pos_force(8, PosForceCommand(value, 1.0, 1.0))
-    with pytest.raises(OpenArmError, match="whole number of 32 bits"):
-        frames.write_register(1, frames.Register.TIMEOUT, -1)
-    with pytest.raises(OpenArmError, match="DM4310"):
-        frames.motor_type("DM1")
+        refused("expected a number", frames.encode_mit, kind, command)
+    refused("expected a number", frames.pos_force, 8, PosForceCommand(value, 1.0, 1.0))
+    refused("whole number of 32 bits", frames.write_register, 1, frames.Register.TIMEOUT, -1)
+    refused("DM4310", frames.motor_type, "DM1")
 
 
 @given(st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans())

@@ -14,6 +14,7 @@ from openarm_common.errors import OpenArmError
 from openarm_common.octree.blocks import VoxelBlocks
 from openarm_common.octree.codec import Payload, decode, encode_full, encode_states, read_file, write_file
 from openarm_common.octree.lattice import Lattice
+from tests.refusals import refused
 
 LATTICE = Lattice.from_bounds(0.02, (-0.16, -0.16, -0.08), (0.16, 0.16, 0.24), align=8)
 
@@ -90,8 +91,7 @@ def test_what_lies_outside_of_a_box_is_counted() -> None:
     values, outside = leaves.on(half)
     assert outside > 0
     assert not np.isnan(values).any()
-    with pytest.raises(OpenArmError, match=r"cells of 0\.02 m, expected 0\.04 m"):
-        leaves.on(half.coarser(1))
+    refused(r"cells of 0\.02 m, expected 0\.04 m", leaves.on, half.coarser(1))
 
 
 @settings(max_examples=100)
@@ -127,25 +127,20 @@ HEAD = b"# Octomap OcTree binary file\nid OcTree\nsize 17\nres 0.02\ndata\n"
 def test_files_that_are_none_are_refused_with_the_reason(content: bytes, text: str, tmp_path: Path) -> None:
     path = tmp_path / "x.bt"
     path.write_bytes(content)
-    with pytest.raises(OpenArmError, match=text):
-        read_file(path)
+    refused(text, read_file, path)
 
 
 def test_missing_files_and_wrong_suffixes_are_named(tmp_path: Path) -> None:
-    with pytest.raises(OpenArmError, match="can't be read"):
-        read_file(tmp_path / "none.bt")
+    refused("can't be read", read_file, tmp_path / "none.bt")
     payload = encode_states(LATTICE, states_of(1))
-    with pytest.raises(OpenArmError, match=r"needs the suffix \.bt"):
-        write_file(tmp_path / "map.ot", payload, 0.02)
-    with pytest.raises(OpenArmError, match="can't be written"):
-        write_file(tmp_path / "no" / "folder" / "map.bt", payload, 0.02)
+    refused(r"needs the suffix \.bt", write_file, tmp_path / "map.ot", payload, 0.02)
+    refused("can't be written", write_file, tmp_path / "no" / "folder" / "map.bt", payload, 0.02)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_box_of_blocks_begins_and_ends_between_blocks() -> None:
     for key, n in ((4, 8), (8, 12)):
-        with pytest.raises(OpenArmError, match="multiples of 8"):
-            VoxelBlocks(Lattice(0.02, (key, 0, 0), (n, 8, 8)))
+        refused("multiples of 8", VoxelBlocks, Lattice(0.02, (key, 0, 0), (n, 8, 8)))
 
 
 @pytest.mark.parametrize("robot", ["openarm_v1", "Röbel 2"])

@@ -12,7 +12,7 @@ import yaml
 
 from openarm_calibration.store.store import places
 from openarm_common.camera.cameras import load_cameras
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.motors.wiring import load_wiring
 from openarm_common.resources import models_dir
 from openarm_common.robot import folder
@@ -23,7 +23,7 @@ from openarm_motion.config import MotionConfig
 from openarm_motion.planning.moves import RequestBoxes, to_joints
 from openarm_motion.service.motion_service import make_arms
 from openarm_sim_bridge.drafting.check import folder_faults
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 
 @pytest.fixture
@@ -54,8 +54,7 @@ def test_all_names_that_the_description_lacks_are_said_at_once(robots):
 
 def test_signs_of_the_mirror_are_as_many_as_joints(robots):
     altered(robots, mirror=[1, -1])
-    with pytest.raises(OpenArmError, match="mirror has 2 signs, arm left has 7 joints"):
-        RobotDescription.from_folder("mine")
+    refused("mirror has 2 signs, arm left has 7 joints", RobotDescription.from_folder, "mine")
 
 
 def test_cameras_are_those_of_the_robot_of_the_process(robots, monkeypatch):
@@ -70,15 +69,13 @@ def test_cameras_are_those_of_the_robot_of_the_process(robots, monkeypatch):
 
 
 def test_an_arm_that_the_robot_lacks_is_refused_with_those_it_has():
-    with pytest.raises(OpenArmError, match="no arm 'third' in robot 'openarm_v1'; arms: left, right"):
-        RobotDescription.load().arm("third")
+    refused("no arm 'third' in robot 'openarm_v1'; arms: left, right", RobotDescription.load().arm, "third")
 
 
 @pytest.mark.long
 def test_arms_that_are_no_mirror_images_are_not_mirrored(robots):
     altered(robots, mirror=[])
-    with pytest.raises(OpenArmError, match="no mirror images"):
-        RobotDescription.from_folder("mine").mirrored([0.0] * 7)
+    refused("no mirror images", RobotDescription.from_folder("mine").mirrored, [0.0] * 7)
 
 
 def test_the_table_of_a_scene_is_that_of_the_robot_where_the_scene_says_nothing_else(nearer, monkeypatch):
@@ -98,22 +95,19 @@ def test_a_scene_in_the_folder_of_the_robot_goes_before_one_of_all_robots(nearer
     own.mkdir()
     (own / "empty.yaml").write_text("table: {top_z: 0.5}")
     assert (load_scene("empty").table.top_z, common.table.top_z) == (0.5, 0.45)
-    with pytest.raises(OpenArmError, match="calibration, calibration_overhead, calibration_wrist, empty, random"):
-        load_scene("demo")
+    refused("calibration, calibration_overhead, calibration_wrist, empty, random", load_scene, "demo")
 
 
 def test_a_robot_that_does_not_say_where_it_works_has_no_scenes(robots, monkeypatch):
     monkeypatch.setenv(folder.ROBOT, "mine")
     altered(robots, work=None)
-    with refuses(Code.CONFIG_INVALID, r"robot\.yaml:work: missing"):
-        Scene()
+    assert refused(r"robot\.yaml:work: missing", Scene).code is Code.CONFIG_INVALID
 
 
 def test_a_table_that_stands_in_the_robot_is_refused(robots):
     work = yaml.safe_load((robots / "robot.yaml").read_text())["work"]
     altered(robots, work=work | {"least_x": 0.2})
-    with pytest.raises(OpenArmError, match=r"stand in the robot: x is 0\.11, expected at least 0\.2"):
-        folder.load_folder("mine")
+    refused(r"stand in the robot: x is 0\.11, expected at least 0\.2", folder.load_folder, "mine")
 
 
 @pytest.mark.requirement("R-06")
@@ -132,8 +126,7 @@ def test_a_robot_may_be_a_folder_anywhere(tmp_path, monkeypatch):
     home, ready = (robot.group_state("panda_arm", name) for name in ("home", "ready"))
     now = arm.start_state(home | {robot.finger_joint("panda"): 0.0})
     assert to_joints(arm, now, np.array([ready[name] for name in arm.names]), RequestBoxes()).duration > 0.1
-    with pytest.raises(OpenArmError, match=r"or the path of a folder with a robot\.yaml"):
-        folder.choose_robot(str(tmp_path))
+    refused(r"or the path of a folder with a robot\.yaml", folder.choose_robot, str(tmp_path))
 
 
 def test_motors_on_can_are_those_that_are_simulated(monkeypatch):
@@ -147,5 +140,4 @@ def test_motors_on_can_are_those_that_are_simulated(monkeypatch):
         assert found[name].joints.damping == motors.gains.damping
     assert found["openarm_v2_cell"] == found["openarm_v2"]
     monkeypatch.setenv(folder.ROBOT, "panda")
-    with pytest.raises(OpenArmError, match=r"hardware\.yaml: missing"):
-        load_wiring()
+    refused(r"hardware\.yaml: missing", load_wiring)

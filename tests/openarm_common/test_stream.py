@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from openarm_common.camera.stream import FrameStream
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.posture import JointNeed, PostureTracker
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 MS = 1_000_000
 ROBOT = RobotDescription.load()
@@ -139,11 +139,9 @@ def test_a_frame_whose_joint_state_can_no_longer_come_is_refused_at_once() -> No
     assert eye.image(103) is None
     assert (eye.stream.counts["early"], eye.stream.waiting_ns) == (1, None)
     eye.now = 6.0
-    with pytest.raises(OpenArmError, match=r"the nearest is \+17.0 ms away"):
-        eye.image(103)
+    refused(r"the nearest is \+17.0 ms away", eye.image, 103)
     eye.tracker.listen(False, 6.0)
-    with pytest.raises(OpenArmError, match=r"the nearest is -80.0 ms away"):
-        eye.image(200)
+    refused(r"the nearest is -80.0 ms away", eye.image, 200)
     assert eye.stream.counts["refused"] == 2
 
 
@@ -158,8 +156,7 @@ def test_after_the_wait_the_nearest_joint_state_within_tolerance_is_used_or_the_
     assert (taken.t_ns, dict(taken.posture.joints)) == (103 * MS, dict.fromkeys(ARM, 0.2))
     assert eye.stream.counts["refused"] == 1
     eye.now = 10.0
-    with refuses(Code.STALE_DATA, r"the nearest is -300.0 ms away"):
-        eye.image(400)
+    assert refused(r"the nearest is -300.0 ms away", eye.image, 400).code is Code.STALE_DATA
 
 
 def test_a_frame_that_is_not_connected_yet_is_waited_for_and_then_named() -> None:
@@ -170,8 +167,7 @@ def test_a_frame_that_is_not_connected_yet_is_waited_for_and_then_named() -> Non
     other = Eye(wait=0.5, frame="lens")
     assert other.image(103) is None
     other.now = 0.6
-    with refuses(Code.NO_TRANSFORM):
-        other.take()
+    assert refused(None, other.take).code is Code.NO_TRANSFORM
 
 
 def test_optional_joints_without_a_publisher_are_named_and_the_frame_is_used() -> None:

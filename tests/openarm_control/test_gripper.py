@@ -6,10 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_control.arm import End
 from openarm_control.gripper import GripperConfig, GripperFollower, GripperGoal, GripperOutcome
 from openarm_control.trajectory import JointGroup
+from tests.refusals import refused
 
 MS = 1_000_000
 FINGER = JointGroup(("finger",), np.array([0.0]), np.array([0.044]), np.array([10.0]))
@@ -163,9 +164,7 @@ def test_a_finger_that_never_rests_times_out() -> None:
     ],
 )
 def test_bad_gripper_goals_are_refused_with_joint_and_value(kwargs: dict, code: Code, message: str) -> None:
-    with pytest.raises(OpenArmError, match=message) as caught:
-        Finger().follower.check(GripperGoal(**kwargs))
-    assert caught.value.code is code
+    assert refused(message, Finger().follower.check, GripperGoal(**kwargs)).code is code
 
 
 def test_rests_on_the_way_do_not_add_up_to_a_stall() -> None:

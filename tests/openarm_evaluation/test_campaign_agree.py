@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import json
 
-import pytest
-
-from openarm_common.errors import OpenArmError
 from openarm_evaluation.campaign.agree import compare, rows_of, text_of
+from tests.refusals import refused
 
 
 def row(seed: int, *, code: str = "OK", arm: str = "left", attempts: int = 1, scene: str = "abc") -> dict:
@@ -33,11 +31,8 @@ def test_scenes_agree_by_outcome_code_arm_and_attempts() -> None:
 
 
 def test_what_cannot_be_compared_is_refused(tmp_path) -> None:
-    with pytest.raises(OpenArmError, match="no scene in common"):
-        compare([row(0)], [row(1)])
-    with pytest.raises(OpenArmError, match=r"seeds \[0\] mean other scenes"):
-        compare([row(0)], [row(0, scene="other")])
-    with pytest.raises(OpenArmError, match="no folder of a campaign"):
-        rows_of(tmp_path)
+    refused("no scene in common", compare, [row(0)], [row(1)])
+    refused(r"seeds \[0\] mean other scenes", compare, [row(0)], [row(0, scene="other")])
+    refused("no folder of a campaign", rows_of, tmp_path)
     (tmp_path / "rows.jsonl").write_text(json.dumps(row(0)) + '\n{"torn')
     assert [found["seed"] for found in rows_of(tmp_path)] == [0]

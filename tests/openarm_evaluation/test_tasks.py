@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import ROBOT
 from openarm_common.scene.scene import Scene
@@ -22,6 +21,7 @@ from openarm_evaluation.campaign.tasks.faults import KINDS
 from openarm_evaluation.campaign.tasks.suites import SUITES, make_task
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.tasks.things import THINGS
+from tests.refusals import refused
 
 #: Of the tasks of OpenArm v1, as figures in the docs have them.
 KNOWN = {
@@ -90,8 +90,7 @@ def test_a_suite_of_two_arms_is_refused_for_a_robot_with_one(monkeypatch):
     robot = RobotDescription.load()
     single = replace(robot, name="single", arms={"right": robot.arms["right"]})
     monkeypatch.setattr(suites.RobotDescription, "load", lambda name="": single)
-    with pytest.raises(OpenArmError, match=r"'pairs' needs two arms, robot 'single' has 1; suites: nominal, clutter"):
-        make_task("pairs", 0)
+    refused(r"'pairs' needs two arms, robot 'single' has 1; suites: nominal, clutter", make_task, "pairs", 0)
     assert isinstance(make_task("nominal", 0).scene, Scene)
 
 
@@ -103,6 +102,5 @@ def test_rows_of_another_robot_are_not_gone_on_with(nearer, monkeypatch, tmp_pat
     (tmp_path / "settings.json").write_text(json.dumps(of_old))  # of a version with one robot
     assert read_rows(tmp_path, options) == []
     monkeypatch.setenv(ROBOT, nearer)
-    with pytest.raises(OpenArmError, match=r"rows of another campaign \(robot was .?openarm_v1"):
-        read_rows(tmp_path, options)
+    refused(r"rows of another campaign \(robot was .?openarm_v1", read_rows, tmp_path, options)
     assert "--robot nearer" in options.command(3)

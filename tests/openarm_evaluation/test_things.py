@@ -30,6 +30,7 @@ from openarm_evaluation.judging.judge import RULES, Sample, fall_of, judge, rise
 from openarm_evaluation.judging.trial import choose_targets
 from openarm_evaluation.objects.household import HOUSEHOLD
 from openarm_evaluation.objects.make import make_objects
+from tests.refusals import refused
 
 TOP = robot_work().table.top_z
 
@@ -155,10 +156,8 @@ def test_sources_of_objects_are_read_or_refused(tmp_path) -> None:
     assert object_sources("") == object_names()
     assert object_sources("superquadrics:3") == ("superquadric:0", "superquadric:1", "superquadric:2")
     for wrong, words in (("superquadrics:0", "N from 1"), (str(tmp_path), "no folder in it has an object.yaml")):
-        with pytest.raises(OpenArmError, match=words):
-            object_sources(wrong)
-    with pytest.raises(OpenArmError, match="of the suites objects, heap, not of 'nominal'"):
-        make_task("nominal", 0, "superquadrics:3")
+        refused(words, object_sources, wrong)
+    refused("of the suites objects, heap, not of 'nominal'", make_task, "nominal", 0, "superquadrics:3")
 
 
 def test_set_without_a_value_is_the_suite_and_depth_finds_what_has_no_colour() -> None:
@@ -168,8 +167,7 @@ def test_set_without_a_value_is_the_suite_and_depth_finds_what_has_no_colour() -
     assert "--suite objects" in options.command(3)
     assert "--objects superquadrics:5" in options.command(3)
     assert options.settings()["objects"] == "superquadrics:5"
-    with pytest.raises(OpenArmError, match="one suite at a time, got 'heap' and 'objects'"):
-        CampaignOptions(set_name="heap", parameters=("objects",))
+    refused("one suite at a time, got 'heap' and 'objects'", CampaignOptions, set_name="heap", parameters=("objects",))
 
 
 def sample(t_s: float, z: float, down: float = 0.0, tilt: float = 0.0) -> Sample:
@@ -250,5 +248,4 @@ def test_the_folders_of_the_suite_are_those_that_are_made(tmp_path) -> None:
     made, kept = posed_object(str(folder)), posed_object("mug")
     assert made.size == pytest.approx(kept.size, abs=1e-4)
     assert len(made.parts) == len(kept.parts)
-    with pytest.raises(OpenArmError, match="no object 'nothing'; objects: apple"):
-        make_objects(tmp_path, ("nothing",))
+    refused("no object 'nothing'; objects: apple", make_objects, tmp_path, ("nothing",))

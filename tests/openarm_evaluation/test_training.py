@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
-from openarm_common.errors import OpenArmError
 from openarm_evaluation.detector.training.report import evaluate as evaluate_onnx
 from openarm_evaluation.detector.training.report import write_page
 from openarm_evaluation.detector.training.samples import Samples, vary
 from openarm_evaluation.detector.yolo_text import write_classes, write_labels
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
+from tests.refusals import refused
 
 torch = pytest.importorskip("torch", reason="the extra `train` is not installed")
 pytest.importorskip("onnx", reason="the extra `train` is not installed")
@@ -133,8 +133,7 @@ def test_training_learns_goes_on_after_a_stop_and_exports_what_it_learnt(data, t
     second.run(lambda row: None)
     for ours, theirs in zip(whole.averaged().parameters(), second.averaged().parameters(), strict=True):
         assert torch.allclose(ours, theirs, atol=1e-5)
-    with pytest.raises(OpenArmError, match="holds a run with other rate"):
-        Fit(data, tmp_path / "parts", CONFIG.model_copy(update={"rate": 1e-3}))
+    refused("holds a run with other rate", Fit, data, tmp_path / "parts", CONFIG.model_copy(update={"rate": 1e-3}))
 
     files = export(whole.averaged(), whole.names, tmp_path, "net")
     network = NetworkDetector(NetworkConfig(model=str(files[0])))
@@ -156,5 +155,4 @@ def test_training_learns_goes_on_after_a_stop_and_exports_what_it_learnt(data, t
 @pytest.mark.requirement("B-65")
 def test_a_data_set_without_pictures_is_refused_with_what_to_do(tmp_path) -> None:
     write_classes(tmp_path, ("a",), ("train",))
-    with pytest.raises(OpenArmError, match=r"no pictures .*; make some: openarm detector data"):
-        Samples(tmp_path, "train")
+    refused(r"no pictures .*; make some: openarm detector data", Samples, tmp_path, "train")

@@ -8,13 +8,14 @@ import math
 import numpy as np
 import pytest
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.scene.scene import Scene, load_scene
 from openarm_evaluation.judging.judge import Sample, judge
 from openarm_evaluation.judging.provenance import machine, scene_hash, versions
 from openarm_evaluation.judging.statistics import interval, summarise
 from openarm_evaluation.judging.trial import Step, Trial, choose_targets, shows
 from openarm_grasp.ros.client import GraspResult
+from tests.refusals import refused
 
 
 def standing(scene: Scene, shift: float = 0.0, speed: float = 0.0) -> dict[str, Sample]:
@@ -34,9 +35,7 @@ def test_target_is_the_first_object_or_the_labelled_one() -> None:
     scene = load_scene("demo")
     assert choose_targets(scene, "") == scene.objects
     assert choose_targets(scene, "blue")[0].label == "blue"
-    with pytest.raises(OpenArmError, match=r"no object 'pink'; it has .*red") as caught:
-        choose_targets(scene, "pink")
-    assert caught.value.code == Code.UNKNOWN_OBJECT
+    assert refused(r"no object 'pink'; it has .*red", choose_targets, scene, "pink").code is Code.UNKNOWN_OBJECT
 
 
 def test_scene_is_recognised_only_when_all_its_objects_rest_at_their_places() -> None:

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_evaluation.detector.yolo_text import read_classes, read_labels, write_classes, write_labels
+from tests.refusals import refused
 
 boxes = st.lists(
     st.tuples(st.integers(0, 2), st.integers(0, 600), st.integers(0, 440), st.integers(1, 40), st.integers(1, 40)),
@@ -53,10 +54,9 @@ def test_a_line_as_cvat_and_labelimg_write_it() -> None:
 )
 @pytest.mark.requirement("B-65")
 def test_label_errors_are_refused_with_file_and_line(line: str, words: str) -> None:
-    with pytest.raises(OpenArmError, match=r"here\.txt:2") as caught:
-        read_labels(f"0 0.5 0.5 0.1 0.1\n{line}\n", 640, 480, 3, "here.txt")
-    assert words in caught.value.message
-    assert caught.value.code is Code.INVALID_ARGUMENT
+    error = refused(r"here\.txt:2", read_labels, f"0 0.5 0.5 0.1 0.1\n{line}\n", 640, 480, 3, "here.txt")
+    assert words in error.message
+    assert error.code is Code.INVALID_ARGUMENT
 
 
 def test_classes_are_read_as_a_list_or_a_mapping(tmp_path) -> None:
@@ -66,5 +66,4 @@ def test_classes_are_read_as_a_list_or_a_mapping(tmp_path) -> None:
     (tmp_path / "dataset.yaml").write_text("names: [a, b, c]\n")
     assert read_classes(tmp_path) == ("a", "b", "c")
     (tmp_path / "dataset.yaml").write_text("names: 3\n")
-    with pytest.raises(OpenArmError, match="expected a list of names"):
-        read_classes(tmp_path)
+    refused("expected a list of names", read_classes, tmp_path)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.scene.scene import Scene, SceneObject
 from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
@@ -22,7 +22,7 @@ from openarm_grasp.robot.interface import PlanGrasp
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_motion.timing.trajectory import Motion
 from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, World, standing
-from tests.refusals import refuses
+from tests.refusals import refused
 
 pytestmark = pytest.mark.requirement("P-20", "R-25")
 
@@ -97,22 +97,18 @@ def test_a_rejected_plan_ends_with_cancelled_and_nothing_has_moved() -> None:
 def test_only_the_plan_that_waits_can_be_answered() -> None:
     world = World(standing("red", 0.3, -0.2))
     gate = world.session.gate
-    with refuses(Code.NOT_READY, "no plan waits"):
-        gate.answer("x", accept=True)
+    assert refused("no plan waits", gate.answer, "x", accept=True).code is Code.NOT_READY
 
     def another_first(world: World, status: Status) -> None:
         assert status.plan is not None
-        with refuses(Code.INVALID_ARGUMENT, f"plan '{status.plan.id}' does"):
-            gate.answer("x", accept=True)
+        assert refused(f"plan '{status.plan.id}' does", gate.answer, "x", accept=True).code is Code.INVALID_ARGUMENT
         confirm(world, status)
-        with pytest.raises(OpenArmError, match="no plan waits"):  # it can't be taken back
-            confirm(world, status, accept=False)
+        refused("no plan waits", confirm, world, status, accept=False)  # it can't be taken back
 
     shown = watched(world, another_first)
     assert world.grasp(confirm=True).success
     assert is_executed(world, *shown)
-    with pytest.raises(OpenArmError, match="no plan waits"):
-        gate.answer(shown[0].id, accept=True)
+    refused("no plan waits", gate.answer, shown[0].id, accept=True)
 
 
 def object_moved(world: World) -> str:
@@ -238,8 +234,7 @@ def test_a_cancel_ends_the_wait() -> None:
     watched(world, cancel)
     assert world.grasp(confirm=True).code is Code.CANCELLED
     assert moves(world) == []
-    with pytest.raises(OpenArmError, match="no plan waits"):
-        world.session.gate.answer("x", accept=True)
+    refused("no plan waits", world.session.gate.answer, "x", accept=True)
 
 
 def test_a_dry_run_asks_nobody() -> None:

@@ -12,6 +12,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.robot.coordination import ArmCoordination, CoordinatedRobot
+from tests.refusals import refused
 
 
 class Robot:
@@ -80,8 +81,7 @@ def test_an_arm_waits_until_the_other_has_gone_on_and_plans_again() -> None:
 def test_what_is_not_the_other_arms_doing_is_reported_at_once() -> None:
     robot = Robot()
     robot.faults = [Code.IN_COLLISION]
-    with pytest.raises(OpenArmError, match="in the way"):
-        run(link(robot, "left").plan(None))  # type: ignore[arg-type]
+    refused("in the way", run, link(robot, "left").plan(None))  # type: ignore[arg-type]
     robot.away("right")
     robot.faults = [Code.UNREACHABLE]
     with pytest.raises(OpenArmError):
@@ -93,8 +93,7 @@ def test_of_two_arms_that_wait_for_each_other_the_right_one_gives_way() -> None:
     robot, coordination = Robot(), ArmCoordination(waiting={"left"})
     robot.away("left")
     robot.faults = [Code.IN_COLLISION]
-    with pytest.raises(OpenArmError, match="in the way"):
-        run(link(robot, "right", coordination).plan(None))  # type: ignore[arg-type]
+    refused("in the way", run, link(robot, "right", coordination).plan(None))  # type: ignore[arg-type]
     robot, coordination = Robot(), ArmCoordination(waiting={"right"})
     robot.away("right")
     robot.faults = [Code.IN_COLLISION]

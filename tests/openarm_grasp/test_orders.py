@@ -6,9 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_grasp.requests.orders import Bin, Bins, Order, load_bins
 from openarm_grasp.requests.request import GraspRequest
+from tests.refusals import refused
 
 BINS = Bins(
     bins={"left": Bin(x=(0.16, 0.28), y=(0.20, 0.44)), "right": Bin(x=(0.16, 0.28), y=(-0.32, -0.20))},
@@ -233,18 +234,13 @@ def test_a_full_bin_is_the_reason_for_what_is_left():
 
 
 def test_orders_and_bins_that_make_no_sense_are_refused(tmp_path):
-    with pytest.raises(OpenArmError, match="no bin for green; there are bins for red, blue"):
-        Order(("green",), BINS)
-    with pytest.raises(OpenArmError, match="an order needs labels"):
-        Order(())
+    refused("no bin for green; there are bins for red, blue", Order, ("green",), BINS)
+    refused("an order needs labels", Order, ())
     path = tmp_path / "bins.yaml"
     path.write_text("bins: {a: {x: [0.2, 0.1], y: [0.0, 0.1]}}\nrest: b\n")
-    with pytest.raises(OpenArmError, match="must ascend") as error:
-        load_bins(path)
-    assert error.value.code is Code.CONFIG_INVALID
+    assert refused("must ascend", load_bins, path).code is Code.CONFIG_INVALID
     path.write_text("bins: {a: {x: [0.1, 0.2], y: [0.0, 0.1]}}\nrest: b\n")
-    with pytest.raises(OpenArmError, match="no bin 'b'; bins: a"):
-        load_bins(path)
+    refused("no bin 'b'; bins: a", load_bins, path)
 
 
 def test_what_others_block_is_asked_for_again_when_they_are_gone():

@@ -18,7 +18,7 @@ from openarm_common.robot.folder import robot_work
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import GraspCandidate, propose
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, yaw_offsets
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 CONFIG = GraspConfig()
 HAND = RobotDescription.load().hand("right").parts
@@ -180,8 +180,7 @@ def test_every_free_spot_is_offered_for_what_a_hand_has_kept() -> None:
 
 def test_a_full_table_has_no_free_spot():
     crowd = [box(x=x, y=y, label="blue") for x in np.arange(0.1, 0.5, 0.08) for y in np.arange(-0.5, 0.0, 0.08)]
-    with refuses(Code.PLACE_FAILED):
-        free_spots("right", box(), crowd, CONFIG, SHOULDERS)
+    assert refused(None, free_spots, "right", box(), crowd, CONFIG, SHOULDERS).code is Code.PLACE_FAILED
 
 
 @pytest.mark.requirement("P-19", "P-03")
@@ -196,8 +195,7 @@ def test_of_the_places_that_may_be_chosen_a_free_one_is():
 
 @pytest.mark.parametrize("position", [(0.05, 0.0), (0.3, 0.7), (float("nan"), 0.1), (0.3, float("inf"), 0.4)])
 def test_a_place_off_the_table_is_refused(position):
-    with refuses(Code.INVALID_ARGUMENT, "not on the table"):
-        check_position(position, box(), [], TABLE)
+    assert refused("not on the table", check_position, position, box(), [], TABLE).code is Code.INVALID_ARGUMENT
 
 
 def test_a_place_on_another_object_is_refused_with_its_name():

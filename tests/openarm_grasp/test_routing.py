@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import pytest
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_grasp.planning.arms import arm_order, out_of_reach, sides
+from tests.refusals import refused
 
 SHOULDERS = {"left": (0.0, 0.15), "right": (0.0, -0.15)}
 
@@ -41,9 +42,7 @@ def test_of_three_arms_the_nearest_come_first():
 
 
 def test_an_unknown_arm_is_refused_with_the_choices():
-    with pytest.raises(OpenArmError, match="auto, left, right") as error:
-        arm_order("middle", 0.0, 0.12, SHOULDERS)
-    assert error.value.code is Code.INVALID_ARGUMENT
+    assert refused("auto, left, right", arm_order, "middle", 0.0, 0.12, SHOULDERS).code is Code.INVALID_ARGUMENT
 
 
 def test_out_of_reach_names_the_nearest_arm_first():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from openarm_common.detection import Detection
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
@@ -20,7 +20,7 @@ from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutco
 from openarm_grasp.requests.task import Grasp, GraspSession
 from openarm_grasp.strategies.pair import check_pair
 from tests.openarm_grasp.scripted import GoHome, Grip, World, standing
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 ARMS = ("left", "right")
 
@@ -63,8 +63,7 @@ def test_a_full_hand_next_to_the_one_that_places_stays_where_it_is(world) -> Non
 @pytest.mark.requirement("P-01")
 def test_a_hand_that_holds_nothing_any_more_is_forgotten(world) -> None:
     assert world.grasp("red", phase="pick").success
-    with pytest.raises(OpenArmError, match="right hand still holds 'red'"):
-        world.session.check_hands(world, GraspRequest("blue"))
+    refused("right hand still holds 'red'", world.session.check_hands, world, GraspRequest("blue"))
     world.session.check_hands(world, GraspRequest("blue", dry_run=True))
     world.gap = 0.0
     world.session.check_hands(world, GraspRequest("blue"))
@@ -78,8 +77,7 @@ def test_what_is_nearly_as_wide_as_the_hand_opens_is_still_held(world) -> None:
     world.session.kept["right"] = replace(world.session.kept["right"], closed=opening - 0.0035)
     world.gap = opening - 0.003  # within the tolerance of an open hand
     assert world.is_open("right")
-    with pytest.raises(OpenArmError, match="right hand still holds 'red'"):
-        world.session.check_hands(world, GraspRequest("blue"))
+    refused("right hand still holds 'red'", world.session.check_hands, world, GraspRequest("blue"))
     world.gap = opening
     world.session.check_hands(world, GraspRequest("blue"))
     assert not world.session.kept
@@ -191,11 +189,9 @@ def test_the_arm_of_a_release_is_the_one_that_holds_and_must_be_said_when_both_d
         return end.value.value
 
     for arm, code in (("middle", Code.INVALID_ARGUMENT), ("", Code.NOT_READY)):
-        with refuses(code):
-            release(arm)
+        assert refused(None, release, arm).code is code
     world.session.kept = {arm: kept(arm, label) for arm, label in (("right", "red"), ("left", "blue"))}
-    with pytest.raises(OpenArmError, match="say which"):
-        release()
+    refused("say which", release)
     assert release("left") == "the left hand is open; it held 'blue'"
     world.gap = 0.0
     assert release() == "the right hand is open; it held 'red'"

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.motors.axis import Axis
 from openarm_common.motors.wiring import load_wiring
 from openarm_hardware.arm import Phase
@@ -26,6 +26,7 @@ from openarm_hardware.exchange import State
 from openarm_hardware.scan import scanned
 from openarm_hardware.settings import Settings
 from tests.openarm_hardware.bench import made_axes
+from tests.refusals import refused
 
 UP = (Phase.FOLLOWING, Phase.FOLLOWING)
 #: The machine of the tests may be busy: what is asserted is what happens, not when.
@@ -159,9 +160,7 @@ def test_a_client_that_dies_leaves_arms_that_are_held_and_then_released(rig: Rig
 def test_a_second_client_is_refused(rig: Rig) -> None:
     """After the time that the first may take to give the buses up."""
     rig.up()
-    with pytest.raises(OpenArmError, match="in use by another process") as refusal:
-        rig.servo()
-    assert refusal.value.code is Code.BUSY
+    assert refused("in use by another process", rig.servo).code is Code.BUSY
 
 
 def test_a_new_client_takes_over_arms_that_are_held_without_letting_them_go(rig: Rig) -> None:
@@ -199,8 +198,7 @@ def test_a_bus_that_is_not_there_is_refused(tmp_path: Path) -> None:
         ("can0", "expected socketcan:INTERFACE"),
     ):
         axes = made_axes((bus, bus))
-        with pytest.raises(OpenArmError, match=text):
-            ServoProcess(axes, PATIENT)
+        refused(text, ServoProcess, axes, PATIENT)
 
 
 def test_a_scan_lists_the_motors_that_answer_and_switches_none_on(rig: Rig) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from openarm_bringup.commands import hardware as commands
 from openarm_common.collision.self_collision import SelfCollision
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.motors.bus import emulated_buses
 from openarm_common.motors.wiring import axes_of, load_wiring
 from openarm_common.robot.description import RobotDescription
@@ -25,7 +25,7 @@ from openarm_hardware.jog import Jog
 from openarm_hardware.touch import TouchGuard
 from openarm_hardware.upkeep import changed, gains, read_gains, zeros
 from tests.openarm_hardware.test_servo_process import PATIENT, Rig
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 pytestmark = pytest.mark.requirement("R-08")
 START = 0.3
@@ -74,15 +74,12 @@ def test_a_zero_is_announced_and_set_where_the_joint_is(rig: RobotRig) -> None:
 def test_motors_that_are_commanded_or_silent_get_no_zero(rig: RobotRig) -> None:
     axis = arm_of(rig)[3]
     rig.ask(fault="silent", joint=axis.joint)
-    with refuses(Code.NOT_READY, f"{axis.joint}.*does not answer"):
-        zeros([axis], flexible=True, write=True)
+    assert refused(f"{axis.joint}.*does not answer", zeros, [axis], flexible=True, write=True).code is Code.NOT_READY
     rig.ask(fault="clear")
     rig.ask(fault="error", joint=axis.joint, value=12)
-    with pytest.raises(OpenArmError, match="not off but rotor too hot"):
-        zeros([axis], flexible=True, write=True)
+    refused("not off but rotor too hot", zeros, [axis], flexible=True, write=True)
     rig.servo()
-    with refuses(Code.BUSY, "in use by another process"):
-        zeros([axis], flexible=True, write=True)
+    assert refused("in use by another process", zeros, [axis], flexible=True, write=True).code is Code.BUSY
 
 
 def test_a_joint_is_moved_there_and_back_and_the_others_stay(rig: RobotRig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,8 +115,7 @@ def test_a_jog_ends_when_a_motor_fails(rig: RobotRig) -> None:
     guard = TouchGuard(SelfCollision(rig.description, [axis.joint for axis in axes]))
     rig.ask(fault="error", joint=axes[1].joint, value=12)
     load: Any = NoLoad()
-    with refuses(Code.NOT_READY, "rotor too hot"):
-        Jog(axes, axes[3].joint, load, guard, PATIENT).run(0.1)
+    assert refused("rotor too hot", Jog(axes, axes[3].joint, load, guard, PATIENT).run, 0.1).code is Code.NOT_READY
 
 
 def test_what_is_set_in_the_motors_is_recorded_and_compared(rig: RobotRig, tmp_path: Path) -> None:
@@ -157,8 +153,7 @@ def test_commands_ask_before_they_set_a_zero_and_say_what_they_changed(
     done = commands.zero(joint, yes=True, emulated=True)
     assert done.success
     assert "was at   0.3000, is at   0.000" in done.text
-    with pytest.raises(OpenArmError, match="no joint or arm 'elbow'; there are"):
-        commands.zero("elbow", yes=True, emulated=True)
+    refused("no joint or arm 'elbow'; there are", commands.zero, "elbow", yes=True, emulated=True)
     record = commands.record_gains(tmp_path / "gains.json", emulated=True)
     assert record.success, record.message
     same = commands.record_gains(tmp_path / "again.json", against=tmp_path / "gains.json", emulated=True)

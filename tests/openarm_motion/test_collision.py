@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
 from openarm_motion.collision.robot import CollisionRobot
 from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.kinematics.chain import ArmKinematics, ArmLinks
 from openarm_motion.planning.arm import Arm
+from tests.refusals import refused
 
 mirror = RobotDescription.load().mirrored
 
@@ -241,11 +241,9 @@ def test_boxes_move_without_a_new_scene(right: Arm, home: dict[str, float]) -> N
 
 
 def test_bad_boxes_are_refused(right: Arm, home: dict[str, float]) -> None:
-    with pytest.raises(OpenArmError, match=r"box 'flat' has size .* expected three edges > 0"):
-        box_from("flat", (0, 0, 0), (0.1, 0.1, 0.0))
+    refused(r"box 'flat' has size .* expected three edges > 0", box_from, "flat", (0, 0, 0), (0.1, 0.1, 0.0))
     box = box_from("twin", (1, 1, 1), (0.1, 0.1, 0.1))
-    with pytest.raises(OpenArmError, match="two boxes have the id 'twin'"):
-        right.scene(home, [box, box])
+    refused("two boxes have the id 'twin'", right.scene, home, [box, box])
 
 
 @pytest.mark.requirement("B-07")
@@ -262,5 +260,4 @@ def test_another_robot_without_srdf_is_checked(six: RobotDescription) -> None:
 def test_meshes_are_refused_with_the_link(six: RobotDescription) -> None:
     text = six.urdf.replace('<box size="0.06 0.06 0.06"/>', '<mesh filename="package://arm/waist.stl"/>', 1)
     robot = RobotDescription.from_urdf(text)
-    with pytest.raises(OpenArmError, match="'waist_link' has meshes"):
-        CollisionRobot(robot, ArmKinematics(robot, "tool"))
+    refused("'waist_link' has meshes", CollisionRobot, robot, ArmKinematics(robot, "tool"))

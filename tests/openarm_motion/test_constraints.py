@@ -21,7 +21,7 @@ from openarm_motion.constraints.plans import to_region
 from openarm_motion.constraints.queries import at_pose, judge
 from openarm_motion.constraints.regions import JointInterval, OrientationRegion, PositionRegion, Region, Volume
 from openarm_motion.planning.moves import RequestBoxes
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 pytestmark = pytest.mark.requirement("R-28")
 
@@ -60,8 +60,7 @@ def test_what_is_drawn_from_a_volume_is_inside_and_what_is_beyond_is_not(kind, s
 
 
 def test_an_interval_without_sense_is_refused_by_name() -> None:
-    with pytest.raises(OpenArmError, match="joint3"):
-        JointInterval("joint3", 0.0, -0.1, 0.1)
+    refused("joint3", JointInterval, "joint3", 0.0, -0.1, 0.1)
 
 
 def test_a_goal_of_joints_of_another_arm_is_refused(arm, now) -> None:
@@ -73,8 +72,7 @@ def test_a_goal_of_joints_of_another_arm_is_refused(arm, now) -> None:
         lambda: along(arm, now, CartesianGoal((arm.kinematics.fk(now.start),), path=region), NOTHING),
         lambda: judge(arm, now, NOTHING, region),
     ):
-        with refuses(Code.INVALID_ARGUMENT, "openarm_left_joint1"):
-            ask()
+        assert refused("openarm_left_joint1", ask).code is Code.INVALID_ARGUMENT
 
 
 def test_the_end_of_a_plan_lies_in_the_region_and_the_nearer_of_two_is_taken(arm, now) -> None:
@@ -109,8 +107,7 @@ def test_poses_are_drawn_until_the_time_is_over_and_of_one_pose_there_is_nothing
 
     def count(region: Region, end: float) -> int:
         tried.clear()
-        with pytest.raises(OpenArmError, match="can't reach the goal"):
-            in_region(arm, region, now.start, end=end)
+        refused("can't reach the goal", in_region, arm, region, now.start, end=end)
         return len(tried)
 
     once = count(at_pose(far, Region()), np.inf)
@@ -172,8 +169,7 @@ def test_a_motion_that_would_take_days_is_refused(arm, now, scale: tuple[float, 
     """Its trajectory would not fit into memory."""
     T = arm.kinematics.fk(now.start)
     T[2, 3] += 0.04
-    with pytest.raises(OpenArmError, match=r"_scale is .*, expected 0.001 to 1"):
-        along(arm, replace(now, scale=scale), CartesianGoal((T,)), NOTHING)
+    refused(r"_scale is .*, expected 0.001 to 1", along, arm, replace(now, scale=scale), CartesianGoal((T,)), NOTHING)
 
 
 def test_a_state_is_judged_by_contacts_and_constraints(arm, now) -> None:
@@ -195,5 +191,4 @@ def test_groups_and_links_are_those_of_the_description(arm, arms) -> None:
     assert set(names.hands()) == {"left_gripper", "right_gripper"}
     assert arm.kinematics.tool_link in names.links_on_tool("right")
     assert names.on_tool("right", "") == pytest.approx(np.eye(4))
-    with pytest.raises(OpenArmError, match="planning groups: left_arm, right_arm"):
-        names.arm_of_group("both_arms")
+    refused("planning groups: left_arm, right_arm", names.arm_of_group, "both_arms")

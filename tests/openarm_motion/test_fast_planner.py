@@ -22,7 +22,7 @@ from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.rrt import FastPlanner
 from openarm_motion.planning.search_kernels import grow
 from tests.openarm_motion.conftest import ruckig_duration
-from tests.refusals import refuses
+from tests.refusals import refused
 
 
 def ask(arm: Arm, home: dict[str, float], start: np.ndarray, goals: np.ndarray, boxes: Sequence[Box] = ()) -> PlanQuery:
@@ -110,10 +110,8 @@ def test_a_goal_in_a_closed_box_is_no_plan_and_a_stop_is_heard(right: Arm, home:
     goal = free_states(right, home, 1, 7)[0]
     hand = right.kinematics.fk(goal)[:3, 3]
     blocked = ask(right, home, start, goal, [box_from("block", hand, (0.1, 0.1, 0.1))])
-    with refuses(Code.NO_PLAN):
-        FastPlanner().plan(replace(blocked, time_limit=0.3))
-    with refuses(Code.CANCELLED):
-        FastPlanner().plan(replace(blocked, stopped=lambda: True))
+    assert refused(None, FastPlanner().plan, replace(blocked, time_limit=0.3)).code is Code.NO_PLAN
+    assert refused(None, FastPlanner().plan, replace(blocked, stopped=lambda: True)).code is Code.CANCELLED
 
 
 @pytest.mark.requirement("N-12")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_motion.kinematics import chain_kernels
 from openarm_motion.kinematics.chain import ArmKinematics
+from tests.refusals import refused
 
 SIDES = ("left", "right")
 
@@ -117,9 +117,7 @@ def test_prismatic_and_continuous_joints_are_part_of_a_chain() -> None:
 
 
 def test_wrong_input_is_refused_by_name(arm: ArmKinematics, description: RobotDescription) -> None:
-    with pytest.raises(OpenArmError, match="tool link 'nowhere' is not in the URDF"):
-        ArmKinematics(description, "nowhere")
-    with pytest.raises(OpenArmError, match="got 3 joint positions, expected 7"):
-        arm.fk([0.0, 0.0, 0.0])
+    refused("tool link 'nowhere' is not in the URDF", ArmKinematics, description, "nowhere")
+    refused("got 3 joint positions, expected 7", arm.fk, [0.0, 0.0, 0.0])
     assert "joint6 would be at 1.000 rad, allowed -0.735 to 0.735" in arm.outside([0, 0, 0, 1, 0, 1, 0], 0.05)
     assert arm.outside([0, 0, 0, 1, 0, 0, 0]) == ""

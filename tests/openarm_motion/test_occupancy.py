@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.octree.distance_field import CameraMoment, DistanceFieldReader, DistanceFieldWriter
 from openarm_common.octree.lattice import Lattice
 from openarm_motion.collision.fast import FastScene
@@ -18,7 +18,7 @@ from openarm_motion.collision.solids import Cylinder, Mesh, Sphere, box_from
 from openarm_motion.kinematics.line import line_contact, solve_line
 from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 LATTICE = Lattice.from_bounds(0.02, (-0.48, -1.0, -0.08), (1.28, 1.0, 1.36))
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
@@ -123,11 +123,9 @@ def test_a_hand_may_back_off_along_cells_next_to_it_but_not_into_them(right: Arm
     now = right.start_state(opened, q, environment=known)
     assert moves.to_pose_on_line(right, now, back, moves.RequestBoxes()).duration > 0.1
     nearest = max(line.q, key=lambda at: -min((c.distance for c in scene.contacts(at)), default=1.0))
-    with pytest.raises(OpenArmError, match="of the map"):
-        moves.to_pose_on_line(right, now, right.kinematics.fk(nearest), moves.RequestBoxes())
+    refused("of the map", moves.to_pose_on_line, right, now, right.kinematics.fk(nearest), moves.RequestBoxes())
     into[0, 3] -= 0.02
-    with pytest.raises(OpenArmError, match="finger would hit the map"):
-        moves.to_pose_on_line(right, now, into, moves.RequestBoxes())
+    refused("finger would hit the map", moves.to_pose_on_line, right, now, into, moves.RequestBoxes())
 
 
 def test_cells_in_the_robot_and_in_known_bodies_are_explained(right: Arm, home: dict[str, float]) -> None:
@@ -170,5 +168,4 @@ def test_bodies_that_are_none_are_refused() -> None:
         (lambda: Mesh("sheet", np.eye(4), flat), "mesh 'sheet' has vertices in one plane"),
         (lambda: Mesh("line", np.eye(4), flat[:2]), "mesh 'line' has 2 vertices, expected at least 4"),
     ):
-        with refuses(Code.INVALID_ARGUMENT, text):
-            make()
+        assert refused(text, make).code is Code.INVALID_ARGUMENT

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_motion.collision.exact import CollisionContext
 from openarm_motion.collision.exact import CollisionScene as Scene
 from openarm_motion.collision.solids import box_from
@@ -15,6 +15,7 @@ from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.moves import RequestBoxes
 from openarm_motion.timing.trajectory import Trajectory
+from tests.refusals import refused
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
@@ -71,6 +72,4 @@ def test_a_start_outside_a_limit_by_rounding_is_no_error(beyond: float, right: A
 def test_a_start_far_outside_a_limit_is_named(right: Arm, home: dict[str, float]) -> None:
     q = [home[name] for name in right.names]
     q[3] = float(right.kinematics.upper[3]) + 0.2
-    with pytest.raises(OpenArmError, match="start: openarm_right_joint4") as caught:
-        right.start_state(home, q)
-    assert caught.value.code == Code.LIMITS
+    assert refused("start: openarm_right_joint4", right.start_state, home, q).code is Code.LIMITS

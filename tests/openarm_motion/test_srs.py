@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.kinematics.srs import SrsArm
+from tests.refusals import refused
 
 mirror = RobotDescription.load().mirrored
 
@@ -102,8 +102,7 @@ def test_the_joint_that_binds_is_named(description: RobotDescription) -> None:
 @pytest.mark.requirement("B-07")
 def test_an_arm_of_another_build_falls_back_to_the_numeric_solver(six: RobotDescription) -> None:
     arm = ArmKinematics(six, "tool")
-    with pytest.raises(OpenArmError, match=r"not a spherical-revolute-spherical arm: it has 6 joints"):
-        SrsArm(arm)
+    refused(r"not a spherical-revolute-spherical arm: it has 6 joints", SrsArm, arm)
     inverse = InverseKinematics(arm)
     assert inverse.method.startswith("numeric")
     rng = np.random.default_rng(10)
@@ -119,5 +118,4 @@ def test_wrong_geometry_is_refused(description: RobotDescription) -> None:
     text = description.urdf.replace('xyz="0.0375 0 0.1205"', 'xyz="0.0375 0.01 0.1205"')
     assert text != description.urdf
     bent = RobotDescription.from_urdf(text)
-    with pytest.raises(OpenArmError, match="miss a common point"):
-        SrsArm(ArmKinematics(bent, description.tcp_link("right")))
+    refused("miss a common point", SrsArm, ArmKinematics(bent, description.tcp_link("right")))

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openarm_common.errors import OpenArmError
 from openarm_motion.kinematics.line import solve_line
 from openarm_motion.planning.arm import Arm
 from openarm_motion.timing.speed_kernels import SPACING
 from openarm_motion.timing.trajectory import JointLimits, Trajectory, profile, time_path, time_polyline
 from tests.openarm_motion.conftest import ruckig_duration, shares_of_limits
+from tests.refusals import refused
 
 NAMES = tuple(f"j{i}" for i in range(7))
 LIMITS = JointLimits(
@@ -128,7 +128,5 @@ def test_a_profile_goes_its_length_within_its_limits(length: float, v: float, a:
 
 
 def test_impossible_limits_are_refused() -> None:
-    with pytest.raises(OpenArmError, match="expected 0 < scale <= 1"):
-        LIMITS.scaled(1.5)
-    with pytest.raises(OpenArmError, match="expected all > 0"):
-        profile(1.0, 0.0, 1.0, 1.0)
+    refused("expected 0 < scale <= 1", LIMITS.scaled, 1.5)
+    refused("expected all > 0", profile, 1.0, 0.0, 1.0, 1.0)

@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.octree.codec import read_file, write_file
 from openarm_common.robot.description import RobotDescription
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
 from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN
 from openarm_octomap.mapper import Frame, Mapper
+from tests.refusals import refused
 
 K = Intrinsics.from_fovy(64, 48, 60.0)
 #: Looks down from 1 m onto z = 0.
@@ -194,10 +195,8 @@ def test_boxes_are_cleared_to_free_or_to_unknown_and_bad_ones_are_refused() -> N
     grid.clear_box((-0.05, -0.05, 0.05), (0.05, 0.05, 0.2), UNKNOWN)
     assert grid.states_at(point) == [UNKNOWN]
     assert grid.clear_box((5, 5, 5), (6, 6, 6)) == 0
-    with pytest.raises(OpenArmError, match="lower one first"):
-        grid.clear_box((0, 0, 0), (1, -1, 1))
-    with pytest.raises(OpenArmError, match="finite"):
-        grid.clear_box((0, 0, 0), (1, math.inf, 1))
+    refused("lower one first", grid.clear_box, (0, 0, 0), (1, -1, 1))
+    refused("finite", grid.clear_box, (0, 0, 0), (1, math.inf, 1))
 
 
 @pytest.mark.requirement("A-75")
@@ -261,8 +260,7 @@ def test_load_replaces_the_map_and_another_resolution_is_refused(tmp_path) -> No
     coarse = OccupancyGrid(GridConfig(resolution=0.05, **SMALL))
     coarse.clear_box((0, 0, 0), (0.1, 0.1, 0.1))
     before = coarse.blocks.states()
-    with pytest.raises(OpenArmError, match=r"cells of 0\.02 m, expected 0\.05 m"):
-        coarse.load(read_file(tmp_path / "map.ot"))
+    refused(r"cells of 0\.02 m, expected 0\.05 m", coarse.load, read_file(tmp_path / "map.ot"))
     np.testing.assert_array_equal(coarse.blocks.states(), before)
 
 
@@ -278,9 +276,7 @@ def test_load_replaces_the_map_and_another_resolution_is_refused(tmp_path) -> No
 )
 @pytest.mark.requirement("B-30")
 def test_scans_that_do_not_fit_are_refused_by_name(depth, intrinsics, T, code) -> None:
-    with pytest.raises(OpenArmError) as error:
-        DepthScan(depth, intrinsics, T, 0.2, 3.0)
-    assert error.value.code == code
+    assert refused(None, DepthScan, depth, intrinsics, T, 0.2, 3.0).code is code
 
 
 @settings(max_examples=30)
@@ -322,8 +318,7 @@ def test_a_map_of_another_robot_is_refused_and_leaves_the_map_as_it_was(tmp_path
     other.clear_box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1), OCCUPIED)
     nodes = other.save(tmp_path / "map.ot")
     assert other.load(tmp_path / "map.ot")[0] == nodes
-    with pytest.raises(OpenArmError, match=r"map\.ot is of robot 'openarm_v1', expected 'nearer'"):
-        mine.load(tmp_path / "map.ot")
+    refused(r"map\.ot is of robot 'openarm_v1', expected 'nearer'", mine.load, tmp_path / "map.ot")
     assert not np.any(mine.snapshot({"states"}).states == OCCUPIED)
     text = (tmp_path / "map.ot").read_bytes().replace(b"# robot openarm_v1\n", b"")
     (tmp_path / "foreign.ot").write_bytes(text)  # as other programs write it

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Detection2D, Detector, rank
+from tests.refusals import refused
 
 GREY = (176, 172, 165)
 RED, BLUE = (200, 25, 25), (25, 60, 205)
@@ -114,9 +115,7 @@ def test_the_score_falls_with_area_fraction_and_saturation(detector: Detector) -
 @pytest.mark.requirement("B-28")
 def test_another_image_is_refused(detector: Detector, image) -> None:
     """The shape and type are named."""
-    with pytest.raises(OpenArmError, match=r"expected \(h, w, 3\) of uint8") as caught:
-        detector.detect(image)
-    assert caught.value.code is Code.BAD_IMAGE
+    assert refused(r"expected \(h, w, 3\) of uint8", detector.detect, image).code is Code.BAD_IMAGE
 
 
 @pytest.mark.requirement("B-27")

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_perception.geometry import footprint
+from tests.refusals import refused
 
 SPACING = 0.0018
 
@@ -97,9 +98,7 @@ def test_a_hidden_part_of_a_circle_does_not_move_it() -> None:
 )
 def test_too_little_outline_is_refused_by_name(points, what: str) -> None:
     """Half an outline does not say how wide the object is."""
-    with pytest.raises(OpenArmError, match=what) as caught:
-        footprint.fit(points, SPACING)
-    assert caught.value.code is Code.NOTHING_DETECTED
+    assert refused(what, footprint.fit, points, SPACING).code is Code.NOTHING_DETECTED
 
 
 def test_the_stated_uncertainty_is_that_of_repeated_fits() -> None:

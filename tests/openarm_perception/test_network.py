@@ -13,7 +13,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_perception.detection.detector import rank
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
 from tests.openarm_perception.onnx_file import boxes, write_network
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 
 def make(path, output, **kwargs) -> NetworkDetector:
@@ -60,8 +60,7 @@ def test_set_classes_looks_for_some_only_and_lists_what_it_knows(tmp_path) -> No
     network = make(tmp_path, boxes((10, 20, 40, 60, 0, 0.9), (100, 58, 130, 88, 1, 0.9)))
     network.set_classes(["ball"])
     assert [d.label for d in network.detect(IMAGE)] == ["ball"]
-    with pytest.raises(OpenArmError, match=r"net\.onnx knows no 'cube'; classes: box, ball"):
-        network.set_classes(["ball", "cube"])
+    refused(r"net\.onnx knows no 'cube'; classes: box, ball", network.set_classes, ["ball", "cube"])
     network.set_classes([])
     assert len(network.detect(IMAGE)) == 2
 
@@ -92,12 +91,9 @@ def test_names_come_from_the_configuration_the_file_or_a_yaml(tmp_path) -> None:
     assert make(tmp_path, boxes()).names == ("box", "ball")
     assert make(tmp_path, boxes(), names="").names == ("c", "d")
     (tmp_path / "net.yaml").unlink()
-    with pytest.raises(OpenArmError, match=r"2 classes have no names: give them .* net\.yaml"):
-        make(tmp_path, boxes(), names="")
-    with pytest.raises(OpenArmError, match="it has 2 classes, but its metadata names 1: box"):
-        make(tmp_path, boxes(), names="['box']")
-    with pytest.raises(OpenArmError, match=r"expected {0: 'a', 1: 'b', …} or a list"):
-        make(tmp_path, boxes(), names="box; ball")
+    refused(r"2 classes have no names: give them .* net\.yaml", make, tmp_path, boxes(), names="")
+    refused("it has 2 classes, but its metadata names 1: box", make, tmp_path, boxes(), names="['box']")
+    refused(r"expected {0: 'a', 1: 'b', …} or a list", make, tmp_path, boxes(), names="box; ball")
 
 
 @pytest.mark.parametrize(
@@ -135,8 +131,7 @@ def test_missing_and_damaged_files_are_refused_by_name(tmp_path) -> None:
 
 def test_without_onnxruntime_networks_are_refused_and_say_what_to_install(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with refuses(Code.ENVIRONMENT, "needs onnxruntime, which is not installed"):
-        make(tmp_path, boxes())
+    assert refused("needs onnxruntime, which is not installed", make, tmp_path, boxes()).code is Code.ENVIRONMENT
 
 
 @pytest.mark.requirement("B-28")
@@ -147,8 +142,7 @@ def test_images_of_another_kind_are_refused(tmp_path) -> None:
         np.zeros((480, 640, 4), np.uint8),
         np.zeros((480, 640, 3), np.float32),
     ):
-        with refuses(Code.BAD_IMAGE, r"expected .h, w, 3. of uint8"):
-            network.detect(image)
+        assert refused(r"expected .h, w, 3. of uint8", network.detect, image).code is Code.BAD_IMAGE
 
 
 def test_other_numbers_do_not_read_the_file_again(tmp_path) -> None:
@@ -163,8 +157,7 @@ def test_other_numbers_do_not_read_the_file_again(tmp_path) -> None:
     with pytest.raises(OpenArmError, match="knows no 'pear'; classes: box, ball"):
         network.changed(network.config.model_copy(update={"classes": ("pear",)}))
     for read_with in ({"model": str(network.path.with_name("other.onnx"))}, {"width": 320}):
-        with pytest.raises(OpenArmError, match="there is no network"):
-            network.changed(network.config.model_copy(update=read_with))
+        refused("there is no network", network.changed, network.config.model_copy(update=read_with))
 
 
 @pytest.mark.parametrize(
@@ -172,14 +165,12 @@ def test_other_numbers_do_not_read_the_file_again(tmp_path) -> None:
 )
 def test_hostile_names_are_refused_in_a_sentence(tmp_path: Path, names: str) -> None:
     path = write_network(tmp_path / "a.onnx", boxes(), names=names)
-    with pytest.raises(OpenArmError, match=r"a\.onnx: its metadata has names") as caught:
-        NetworkDetector(NetworkConfig(model=str(path)))
-    assert len(caught.value.message) < 500
+    error = refused(r"a\.onnx: its metadata has names", NetworkDetector, NetworkConfig(model=str(path)))
+    assert len(error.message) < 500
 
 
 @pytest.mark.parametrize("text", ["names: 5", "names: {x: box}", "names: {[1]: box}"])
 def test_names_next_to_the_file_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
     path = write_network(tmp_path / "a.onnx", boxes(), names="")
     path.with_suffix(".yaml").write_text(text)
-    with pytest.raises(OpenArmError, match=r"a\.yaml"):
-        NetworkDetector(NetworkConfig(model=str(path)))
+    refused(r"a\.yaml", NetworkDetector, NetworkConfig(model=str(path)))

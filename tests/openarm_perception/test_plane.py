@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
 from openarm_perception.geometry import plane
 from openarm_perception.geometry.depth import DepthLimits, View
+from tests.refusals import refused
 
 K = Intrinsics.from_fovy(640, 480, 60.0)
 FLAT = (0.0, 0.0, 1.0)
@@ -43,9 +44,7 @@ def test_pixels_above_the_horizon_are_refused(tilt: float, v: float) -> None:
     """A camera that looks level or up at 1 m over the plane."""
     forward = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
     T = se3.make(se3.rotation_from_z_y(forward, np.cross(forward, (0.0, -1.0, 0.0))), (0.0, 0.0, 1.0))
-    with pytest.raises(OpenArmError, match="horizon") as error:
-        plane.intersect((320.0, v), K, T, FLAT, 0.0)
-    assert error.value.code == Code.NOTHING_DETECTED
+    assert refused("horizon", plane.intersect, (320.0, v), K, T, FLAT, 0.0).code is Code.NOTHING_DETECTED
 
 
 def blind(tabletop, height: float) -> Localizer:
@@ -106,8 +105,7 @@ def test_without_depth_what_has_no_known_height_is_refused_as_before(tabletop, d
     thing = tabletop.Thing("blue", "box", (0.05, 0.05, 0.05), 0.3, 0.0, 0.3)
     seen = tabletop.render([thing])
     (found,) = detector.detect(seen.rgb)
-    with pytest.raises(OpenArmError, match="pixels with a depth of"):
-        without_depth(blind(tabletop, 0.05), found, seen)
+    refused("pixels with a depth of", without_depth, blind(tabletop, 0.05), found, seen)
 
 
 @pytest.mark.parametrize("wrong", ["red", "red=tall", "red=3"])

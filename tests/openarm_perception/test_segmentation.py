@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 from openarm_perception.segmentation.clusters import Segmentation, segment
 from openarm_perception.segmentation.colors import join_smooth
@@ -19,6 +19,7 @@ from openarm_perception.segmentation.parts import joined
 from openarm_perception.segmentation.support import find_support
 from openarm_perception.segmentation.views import merge_views
 from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
+from tests.refusals import refused
 
 pytestmark = pytest.mark.requirement("R-19")
 
@@ -171,20 +172,15 @@ def test_a_background_takes_away_what_was_there_before(tabletop):
     found = segment(points, full.intrinsics, T_base_camera=full.T_base_camera, background=background)
     assert len(found.clusters) == 1
     assert found.clusters[0].size[:2] == pytest.approx(thing.size[:2], abs=0.008)
-    with pytest.raises(OpenArmError, match="same camera in the same place"):
-        segment(points, full.intrinsics, background=background[:-1])
-    with pytest.raises(OpenArmError, match="has it moved"):
-        segment(points, full.intrinsics, background=background + np.float32(0.5))
+    refused("same camera in the same place", segment, points, full.intrinsics, background=background[:-1])
+    refused("has it moved", segment, points, full.intrinsics, background=background + np.float32(0.5))
 
 
 def test_without_a_plane_nothing_is_found():
     points = np.full((60, 80, 3), np.nan, np.float32)
-    with pytest.raises(OpenArmError) as error:
-        find_support(points)
-    assert error.value.code == Code.NOTHING_DETECTED
+    assert refused(None, find_support, points).code is Code.NOTHING_DETECTED
     points[:] = np.random.default_rng(0).uniform(0.5, 1.5, points.shape)
-    with pytest.raises(OpenArmError, match="no plane"):
-        find_support(points)
+    refused("no plane", find_support, points)
 
 
 def test_noise_is_measured_at_the_plane(tabletop):

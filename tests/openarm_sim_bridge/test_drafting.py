@@ -23,7 +23,7 @@ from openarm_sim_bridge.drafting.draft import draft_folder
 from openarm_sim_bridge.drafting.edits import Edits
 from openarm_sim_bridge.drafting.mesh_files import _budgets, write_stl
 from openarm_sim_bridge.drafting.mjcf import UrdfDraft, compiled
-from tests.refusals import refuses
+from tests.refusals import refused
 
 #: Two arms that mirror each other, of a hinge off the origin of its body, a slide, and two fingers that are coupled.
 ARM = """
@@ -190,8 +190,7 @@ def test_what_a_urdf_cannot_have_is_named(mjcf, find, replace, words):
     text = mjcf.read_text()
     assert find in text
     mjcf.write_text(text.replace(find, replace, 1))
-    with refuses(Code.CONFIG_INVALID, words):
-        UrdfDraft("two", compiled(mjcf), Edits.model_validate(EDITS))
+    assert refused(words, UrdfDraft, "two", compiled(mjcf), Edits.model_validate(EDITS)).code is Code.CONFIG_INVALID
 
 
 def test_a_draft_says_what_is_left_to_do(folder):
@@ -283,10 +282,8 @@ def test_a_draft_of_a_urdf_brings_its_meshes_and_names_its_shapes(folder, tmp_pa
     ],
 )
 def test_arms_that_are_none_are_refused(folder, tmp_path, arms, words):
-    with refuses(Code.INVALID_ARGUMENT, words):
-        draft_folder(tmp_path / "three", folder / "two.urdf", arms)
-    with pytest.raises(OpenArmError, match="has a robot"):
-        draft_folder(folder, folder / "two.urdf", ARMS)
+    assert refused(words, draft_folder, tmp_path / "three", folder / "two.urdf", arms).code is Code.INVALID_ARGUMENT
+    refused("has a robot", draft_folder, folder, folder / "two.urdf", ARMS)
 
 
 def test_triangles_are_shared_by_weight_and_never_more_than_allowed():

@@ -11,12 +11,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.resources import models_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import ROBOT
 from openarm_common.scene.scene import PALETTE, load_scene
 from openarm_sim_bridge.world.export import VIEWS, export, render, render_png
+from tests.refusals import refused
 
 
 @pytest.mark.requirement("A-12")
@@ -75,17 +76,11 @@ def test_files_of_a_robot_with_meshes_name_them_from_their_folder_and_are_read_a
 
 
 def test_what_cannot_be_exported_is_refused() -> None:
-    with pytest.raises(OpenArmError, match="unknown kind 'sdf'; kinds: urdf, mjcf, srdf"):
-        export("sdf")  # type: ignore[arg-type]
-    with pytest.raises(OpenArmError, match="mjcf only") as caught:
-        export("urdf", scene="demo")
-    assert caught.value.code is Code.INVALID_ARGUMENT
-    with pytest.raises(OpenArmError, match="no scene 'moon'"):
-        export("mjcf", scene="moon")
-    with pytest.raises(OpenArmError, match=r"unknown view 'inside'; views: front.*cameras: overhead, wrist"):
-        render(view="inside")
-    with pytest.raises(OpenArmError, match="no state 'dance'"):
-        render(posture="dance")
+    refused("unknown kind 'sdf'; kinds: urdf, mjcf, srdf", export, "sdf")  # type: ignore[arg-type]
+    assert refused("mjcf only", export, "urdf", scene="demo").code is Code.INVALID_ARGUMENT
+    refused("no scene 'moon'", export, "mjcf", scene="moon")
+    refused(r"unknown view 'inside'; views: front.*cameras: overhead, wrist", render, view="inside")
+    refused("no state 'dance'", render, posture="dance")
 
 
 @pytest.mark.long
@@ -113,5 +108,4 @@ def test_every_view_shows_the_robot(view: str) -> None:
 
 
 def test_a_picture_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(OpenArmError, match="cannot write"):
-        render_png(tmp_path / "nowhere" / "a.png", width=64, height=64)
+    refused("cannot write", render_png, tmp_path / "nowhere" / "a.png", width=64, height=64)

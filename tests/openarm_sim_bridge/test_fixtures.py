@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene, parse_scene
 from openarm_sim_bridge.world.model import compile_model
-from tests.refusals import refuses
+from tests.refusals import refused
 
 MODEL = "<mujoco><worldbody>{}</worldbody></mujoco>"
 BODY = '<body name="thing"><geom name="thing" size="0.01" contype="0" conaffinity="0" mass="0.1"/></body>'
@@ -61,8 +61,7 @@ def test_a_fixture_that_can_not_be_had_is_refused(tmp_path: Path, text: str | No
     if text is not None:
         path.write_text(text)
     scene = parse_scene(fixed(path, **keys), "scene")
-    with refuses(Code.CONFIG_INVALID, words):
-        compile_model(RobotDescription.load(), scene, {})
+    assert refused(words, compile_model, RobotDescription.load(), scene, {}).code is Code.CONFIG_INVALID
 
 
 @pytest.mark.parametrize(
@@ -70,8 +69,6 @@ def test_a_fixture_that_can_not_be_had_is_refused(tmp_path: Path, text: str | No
     [({"y_axis": [0, 0, 2]}, "parallel or zero"), ({"model": ""}, "model"), ({"sise": 1}, "sise")],
 )
 def test_a_wrong_fixture_is_named(tmp_path: Path, keys: dict, words: str) -> None:
-    with refuses(Code.SCENE_INVALID, words):
-        parse_scene(fixed(tmp_path / "thing.xml", **keys), "scene")
+    assert refused(words, parse_scene, fixed(tmp_path / "thing.xml", **keys), "scene").code is Code.SCENE_INVALID
     twice = fixed(tmp_path / "thing.xml")["fixtures"] * 2  # type: ignore[operator]
-    with pytest.raises(OpenArmError, match="'thing' is used twice"):
-        parse_scene({"fixtures": twice}, "scene")
+    refused("'thing' is used twice", parse_scene, {"fixtures": twice}, "scene")

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from openarm_common.errors import OpenArmError
 from openarm_common.objects.model import load_object, object_names
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
@@ -17,6 +16,7 @@ from openarm_common.scene.scene import Scene, SceneObject, parse_scene
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.object_meshes import texture_picture
 from openarm_sim_bridge.world.stage import Stage, with_object
+from tests.refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +79,8 @@ def test_an_object_is_spawned_and_taken_out_while_the_world_runs(stage) -> None:
     world.step(500)
     assert [item.object.object for item in world.objects()] == ["mug", "superquadric:7"]
     assert world.object("it_5").T_world_object[2, 3] == pytest.approx(0.4 + 0.5 * more.objects[1].size[2], abs=1e-3)
-    with pytest.raises(OpenArmError, match="no object 'nothing'"):
-        with_object(scene, mesh("nothing", 5))
-    with pytest.raises(OpenArmError, match="already"):
-        with_object(scene, mesh("mug"))
+    refused("no object 'nothing'", with_object, scene, mesh("nothing", 5))
+    refused("already", with_object, scene, mesh("mug"))
 
 
 def test_a_request_to_spawn_says_which_object_and_side() -> None:
@@ -130,6 +128,5 @@ def test_appearance_changes_light_table_and_paper_and_nothing_else(stage) -> Non
 def test_textures_that_are_none_are_refused(tmp_path) -> None:
     path = tmp_path / "texture.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\nnothing")
-    with pytest.raises(OpenArmError, match="no PNG or JPEG that can be read"):
-        texture_picture(path)
+    refused("no PNG or JPEG that can be read", texture_picture, path)
     assert all(texture_picture(load_object(name).texture).shape[2] == 3 for name in object_names()[:3])  # type: ignore

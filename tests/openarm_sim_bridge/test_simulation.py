@@ -26,7 +26,7 @@ from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.world.world import World
 from tests.conftest import DEADLINE_S
-from tests.refusals import refuses
+from tests.refusals import refused, refuses
 
 MODEL = """
 <mujoco><compiler angle="radian"/><option timestep="0.002" gravity="0 0 0" integrator="implicitfast"/><worldbody>
@@ -203,8 +203,7 @@ def test_steps_that_are_left_when_time_goes_on_are_not_said_to_be_done(bench: Be
     bench.simulation.call(lambda: bench.simulation.set_paused(True)).result(DEADLINE_S)
     stepping = bench.simulation.call(lambda: bench.simulation.advance(10_000_000)).result(DEADLINE_S)
     bench.simulation.call(lambda: bench.simulation.set_paused(False)).result(DEADLINE_S)
-    with refuses(Code.CANCELLED, "stepping ended early"):
-        stepping.result(DEADLINE_S)
+    assert refused("stepping ended early", stepping.result, DEADLINE_S).code is Code.CANCELLED
 
 
 def test_steps_are_refused_where_they_make_no_sense(bench: Bench) -> None:
@@ -304,8 +303,7 @@ def test_bad_commands_are_refused_with_joint_and_value(
     names: list[str], positions: list[float], code: Code, message: str
 ) -> None:
     _, controller = make_controller()
-    with refuses(code, message):
-        controller.check_command(names, positions)
+    assert refused(message, controller.check_command, names, positions).code is code
 
 
 def test_commands_for_a_joint_that_follows_a_goal_are_reported() -> None:
