@@ -85,8 +85,7 @@ def test_a_message_a_service_and_actions_make_the_round_trip(ros, peer) -> None:
     assert heard[0].transforms[0].child_frame_id == "tool"
 
     answer = ros.call(
-        ros.node.create_client(ComputeIK, "/compute"),
-        ComputeIK.Request(arm="left", position_only=True, seed=[0.5, -1]),
+        ros.node.create_client(ComputeIK, "/compute"), ComputeIK.Request(arm="left", position_only=True, seed=[0.5, -1])
     )
     assert (answer.success, answer.message, list(answer.joint_positions)) == (True, "left", [1.0, -2.0])
 

@@ -17,12 +17,7 @@ from openarm_common.octree.codec import decode
 from openarm_common.octree.distance_field import field_path
 from openarm_common.octree.lattice import Lattice
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.convert import (
-    array_to_image,
-    info_from_intrinsics,
-    matrix_to_transform,
-    ns_to_stamp,
-)
+from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, ns_to_stamp
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF
 from openarm_octomap.ros.node import OctomapNode
 

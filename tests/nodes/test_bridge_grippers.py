@@ -12,9 +12,7 @@ from openarm_interfaces.msg import ObjectStateArray
 from openarm_interfaces.srv import InjectFault, SetPause, SpawnObject
 from sensor_msgs.msg import JointState
 
-from openarm_common.ros.convert import (
-    point,
-)
+from openarm_common.ros.convert import point
 from openarm_common.ros.node import QOS_SENSOR
 
 

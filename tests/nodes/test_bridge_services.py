@@ -12,9 +12,7 @@ from openarm_interfaces.msg import ObjectStateArray
 from openarm_interfaces.srv import ResetWorld, SetPause, SpawnObject, StepSimulation
 from sensor_msgs.msg import JointState
 
-from openarm_common.ros.convert import (
-    stamp_to_ns,
-)
+from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.node import QOS_COMMAND
 
 

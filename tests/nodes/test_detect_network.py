@@ -53,11 +53,7 @@ def becomes(bench: Bench, *expected: list[str]) -> None:
 
 @pytest.mark.parametrize(
     ("detector", "called"),
-    [
-        ("network", ["red", "box"]),
-        ("tag", ["tag_7", "red", "box"]),
-        ("anything", ["anything", "red", "box"]),
-    ],
+    [("network", ["red", "box"]), ("tag", ["tag_7", "red", "box"]), ("anything", ["anything", "red", "box"])],
 )
 @pytest.mark.requirement("P-17")
 def test_every_detector_finds_the_box_behind_the_same_topic(ros, camera, model, detector, called) -> None:

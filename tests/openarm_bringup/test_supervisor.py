@@ -86,11 +86,7 @@ class Running:
     """A supervisor under test and what it has reported."""
 
     def __init__(
-        self,
-        folder: Path,
-        nodes: dict[str, NodeSpec],
-        ladder: Ladder | None = None,
-        probe: FileProbe | None = None,
+        self, folder: Path, nodes: dict[str, NodeSpec], ladder: Ladder | None = None, probe: FileProbe | None = None
     ) -> None:
         self.events: list[Event] = []
         self.supervisor = Supervisor(

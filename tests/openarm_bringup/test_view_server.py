@@ -328,10 +328,7 @@ async def test_the_plan_that_waits_is_confirmed_or_rejected_from_the_page(bench:
 
 @with_bench
 async def test_what_the_graph_refuses_is_said(bench: Bench) -> None:
-    assert await bench.post("/cancel", {}) == (
-        200,
-        {"success": False, "code": "REFUSED", "message": "no grasp runs"},
-    )
+    assert await bench.post("/cancel", {}) == (200, {"success": False, "code": "REFUSED", "message": "no grasp runs"})
     assert (await bench.post("/reset", {"scene": "demo"}))[1]["code"] == "NOT_READY"
 
 

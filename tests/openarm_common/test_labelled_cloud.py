@@ -29,11 +29,7 @@ def test_a_cloud_comes_back_from_its_message_bit_by_bit(labels: list[int]) -> No
     after = labelled_cloud_from_msg(message)
     assert np.array_equal(before.points, after.points)
     assert np.array_equal(before.labels, after.labels)
-    assert (message.header.frame_id, message.width, message.height) == (
-        "overhead_color_optical_frame",
-        len(labels),
-        1,
-    )
+    assert (message.header.frame_id, message.width, message.height) == ("overhead_color_optical_frame", len(labels), 1)
 
 
 def test_points_that_are_not_finite_are_left_out() -> None:

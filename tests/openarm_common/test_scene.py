@@ -17,15 +17,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir, models_dir
 from openarm_common.robot.folder import robot_work
 from openarm_common.robot.work import Table
-from openarm_common.scene.scene import (
-    PALETTE,
-    Scene,
-    SceneObject,
-    load_scene,
-    parse_object,
-    parse_scene,
-    random_scene,
-)
+from openarm_common.scene.scene import PALETTE, Scene, SceneObject, load_scene, parse_object, parse_scene, random_scene
 from tests.refusals import refuses
 
 

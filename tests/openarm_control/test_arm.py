@@ -15,12 +15,7 @@ from openarm_common.robot.servos import ServoModel
 from openarm_control.arm import End, FollowerState, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
 from openarm_control.carrier import Carrier, CarrierConfig
 from openarm_control.follower import Tracker
-from openarm_control.trajectory import (
-    JointGroup,
-    Trajectory,
-    TrajectoryError,
-    TrajectoryResult,
-)
+from openarm_control.trajectory import JointGroup, Trajectory, TrajectoryError, TrajectoryResult
 
 MS = 1_000_000
 GROUP = JointGroup(("j1", "j2"), np.array([-2.0, -2.0]), np.array([2.0, 2.0]), np.array([4.0, 4.0]))

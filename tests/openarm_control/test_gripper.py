@@ -154,11 +154,7 @@ def test_a_finger_that_never_rests_times_out() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "code", "message"),
     [
-        (
-            {"position": 0.1},
-            Code.LIMITS,
-            r"position of finger is 0\.1000, out of its limits 0\.000 to 0\.044",
-        ),
+        ({"position": 0.1}, Code.LIMITS, r"position of finger is 0\.1000, out of its limits 0\.000 to 0\.044"),
         ({"position": float("nan")}, Code.INVALID_ARGUMENT, "position of finger is nan"),
         ({"position": 0.01, "max_effort": float("inf")}, Code.INVALID_ARGUMENT, "effort of finger is inf"),
     ],

@@ -9,14 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import Code
-from openarm_control.trajectory import (
-    JointGroup,
-    JointSpline,
-    Trajectory,
-    TrajectoryError,
-    TrajectoryResult,
-    checked,
-)
+from openarm_control.trajectory import JointGroup, JointSpline, Trajectory, TrajectoryError, TrajectoryResult, checked
 
 GROUP = JointGroup(("j1", "j2"), np.array([-1.0, -2.0]), np.array([1.0, 2.0]), np.array([4.0, 4.0]))
 T2 = np.array([0.5, 1.0])

@@ -15,15 +15,7 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.candidates import (
-    Box,
-    held_boxes,
-    obstacle_boxes,
-    propose,
-    target_box,
-    tcp_height,
-    turned,
-)
+from openarm_grasp.planning.candidates import Box, held_boxes, obstacle_boxes, propose, target_box, tcp_height, turned
 from tests.refusals import refuses
 
 TABLE = 0.40

@@ -326,10 +326,7 @@ def test_what_a_controller_executes_begins_and_ends_with_zero_velocity_and_accel
         first, last = spline.sample(float(motion.t[0]))[0], spline.sample(spline.end_s)[0]
         jerk = arms[side].limits(1.0).jerk
         for h in (0.001, 0.002, 0.005, 0.01):
-            for moved in (
-                spline.sample(float(motion.t[0]) + h)[0] - first,
-                last - spline.sample(spline.end_s - h)[0],
-            ):
+            for moved in (spline.sample(float(motion.t[0]) + h)[0] - first, last - spline.sample(spline.end_s - h)[0]):
                 assert np.all(np.abs(moved) <= 1.1 * jerk * h**3 / 6.0 + 1e-12), (side, h, moved)
 
 

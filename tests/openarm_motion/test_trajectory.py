@@ -38,10 +38,7 @@ def assert_within_limits(trajectory: Trajectory, limits: JointLimits) -> None:
 
 
 @settings(max_examples=8)
-@given(
-    st.lists(st.lists(st.floats(-1.5, 1.5), min_size=7, max_size=7), min_size=2, max_size=4),
-    st.floats(0.1, 1.0),
-)
+@given(st.lists(st.lists(st.floats(-1.5, 1.5), min_size=7, max_size=7), min_size=2, max_size=4), st.floats(0.1, 1.0))
 def test_polylines_are_exact_and_within_limits_at_every_sample(points: list[list[float]], scale: float) -> None:
     waypoints = np.array(points)
     limits = LIMITS.scaled(scale)

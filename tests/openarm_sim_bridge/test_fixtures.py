@@ -65,8 +65,7 @@ def test_a_fixture_that_can_not_be_had_is_refused(tmp_path: Path, text: str | No
 
 
 @pytest.mark.parametrize(
-    ("keys", "words"),
-    [({"y_axis": [0, 0, 2]}, "parallel or zero"), ({"model": ""}, "model"), ({"sise": 1}, "sise")],
+    ("keys", "words"), [({"y_axis": [0, 0, 2]}, "parallel or zero"), ({"model": ""}, "model"), ({"sise": 1}, "sise")]
 )
 def test_a_wrong_fixture_is_named(tmp_path: Path, keys: dict, words: str) -> None:
     assert refused(words, parse_scene, fixed(tmp_path / "thing.xml", **keys), "scene").code is Code.SCENE_INVALID

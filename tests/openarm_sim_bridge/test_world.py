@@ -255,10 +255,7 @@ def test_a_diverged_simulation_is_reported_and_a_reset_mends_it(
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        (
-            {"joint_names": ("shoulder", "wrist")},
-            "lacks a joint: Invalid name 'wrist'. Valid names: .*ball",
-        ),
+        ({"joint_names": ("shoulder", "wrist")}, "lacks a joint: Invalid name 'wrist'. Valid names: .*ball"),
         ({"joint_names": ("mimic",)}, "no actuator for the joints mimic"),
         ({"objects": (UPPER_OBJECT,)}, "lacks a joint: Invalid name 'upper'"),
         ({"home": {"knee": 0.0}}, "lacks a joint: Invalid name 'knee'"),

@@ -103,12 +103,7 @@ def approach(arm: str, y: float) -> PlanApproach.Goal:
     cube = CollisionBox(id="cube", pose=matrix_to_pose(se3.make(None, (0.27, y, 0.425))))
     cube.size.x = cube.size.y = cube.size.z = 0.05
     return PlanApproach.Goal(
-        arm=arm,
-        targets=targets,
-        obstacles=[cube],
-        touchable=["cube"],
-        attached_after_approach=True,
-        velocity_scale=1.0,
+        arm=arm, targets=targets, obstacles=[cube], touchable=["cube"], attached_after_approach=True, velocity_scale=1.0
     )
 
 

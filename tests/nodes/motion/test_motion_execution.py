@@ -15,10 +15,7 @@ import pytest
 from control_msgs.action import FollowJointTrajectory
 from openarm_interfaces.action import ExecuteTrajectory
 
-from openarm_common.ros.convert import (
-    trajectory_from_msg,
-    trajectory_to_msg,
-)
+from openarm_common.ros.convert import trajectory_from_msg, trajectory_to_msg
 from openarm_motion.timing.trajectory import Trajectory
 from tests.nodes.motion.conftest import SLOWER
 

@@ -18,9 +18,7 @@ from unique_identifier_msgs.msg import UUID
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import (
-    matrix_to_pose,
-)
+from openarm_common.ros.convert import matrix_to_pose
 from openarm_common.ros.holds import Holder
 from openarm_common.scene.scene import load_scene
 from openarm_motion.planning.planner import PlannedPath, PlanQuery
