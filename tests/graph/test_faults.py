@@ -22,7 +22,7 @@ from openarm_motion.ros.client import MotionClient
 from tests.graph.asking import Asked
 from tests.graph.control_log import ControlLog, hanging, last_move_ns
 
-pytestmark = [pytest.mark.graph, pytest.mark.long, pytest.mark.alone]
+pytestmark = [pytest.mark.graph, pytest.mark.long, pytest.mark.alone, pytest.mark.usefixtures("fresh")]
 
 #: The deadline that /joint_states are offered with, s.
 DEADLINE = 0.2
@@ -72,7 +72,6 @@ def height(observer: Observer) -> float:
 
 
 @pytest.mark.requirement("R-21")
-@pytest.mark.usefixtures("fresh")
 def test_the_emergency_stop_works_while_motion_grasp_and_supervisor_hang(
     up: Any, observer: Observer, client: GraspClient, control: ControlLog
 ) -> None:
@@ -100,7 +99,6 @@ def test_the_emergency_stop_works_while_motion_grasp_and_supervisor_hang(
 
 
 @pytest.mark.requirement("R-21")
-@pytest.mark.usefixtures("fresh")
 def test_motion_killed_while_an_arm_moves_is_named_the_arm_holds_and_the_next_pick_succeeds(
     up: Any, observer: Observer, client: GraspClient, control: ControlLog
 ) -> None:
@@ -126,7 +124,6 @@ def test_motion_killed_while_an_arm_moves_is_named_the_arm_holds_and_the_next_pi
 
 
 @pytest.mark.requirement("R-21", "P-01")
-@pytest.mark.usefixtures("fresh")
 def test_grasp_killed_in_lift_is_named_and_its_successor_opens_no_hand_that_holds_something(
     up: Any, observer: Observer, client: GraspClient
 ) -> None:
@@ -158,7 +155,6 @@ def test_grasp_killed_in_lift_is_named_and_its_successor_opens_no_hand_that_hold
 
 # The last one: where a process was stopped for so long, ports of shared memory may stay broken.
 @pytest.mark.requirement("N-23")
-@pytest.mark.usefixtures("fresh")
 def test_joint_states_go_on_while_a_node_hangs_that_reads_them(up: Any, control: ControlLog) -> None:
     control.wait(lambda: len(control.joint_states_ns) > 100, 20.0, "joint states")
     with hanging(up.node("octomap").pid):

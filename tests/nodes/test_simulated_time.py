@@ -12,11 +12,12 @@ from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, BaseNode
 from openarm_motion.ros.node import MotionNode
 from openarm_perception.ros.detector_node import DetectNode
 
+pytestmark = pytest.mark.requirement("P-30")
+
 NOW = 123_000_000_000
 
 
 @pytest.mark.parametrize("kind", [MotionNode, DetectNode])
-@pytest.mark.requirement("P-30")
 def test_a_node_takes_simulated_time(ros, kind: type[BaseNode]) -> None:
     node = ros.start(kind, use_sim_time=True)
     stamps: list[int] = []
@@ -34,7 +35,6 @@ def test_a_node_takes_simulated_time(ros, kind: type[BaseNode]) -> None:
     ros.spin_until(lambda: stamps.count(NOW) >= 2, what="diagnostics with simulated stamps")
 
 
-@pytest.mark.requirement("P-30")
 def test_the_bridge_stamps_with_the_time_it_makes(bridge) -> None:
     bench = bridge(images=False, use_sim_time=True)
     reports = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)

@@ -9,6 +9,8 @@ import pytest
 from openarm_common.collision.held_apart import held_apart
 from openarm_common.robot.description import RobotDescription
 
+pytestmark = pytest.mark.requirement("R-05")
+
 #: A flat arm: `tip` turns on `arm` about z, at `gap` next to the post; a second joint turns `post` where it is.
 _URDF = """<robot name="flat">
  <link name="base"/>
@@ -32,7 +34,6 @@ def flat(x: float, lower: float) -> RobotDescription:
     return RobotDescription.from_urdf(_URDF.format(x=x, lower=lower), '<robot name="flat"/>')
 
 
-@pytest.mark.requirement("R-05")
 def test_the_least_distance_over_the_range_of_the_joints_is_found() -> None:
     """The tip comes nearest at the end of its swing: the distance there, to 10 µm."""
     x, end = 0.03, 2.9
@@ -42,7 +43,6 @@ def test_the_least_distance_over_the_range_of_the_joints_is_found() -> None:
     assert found == {frozenset({"post", "tip"}): pytest.approx(away, abs=1e-5)}
 
 
-@pytest.mark.requirement("R-05")
 def test_links_that_touch_somewhere_or_stay_far_are_left_out() -> None:
     assert held_apart(flat(0.04, 0.0), 0.02) == {}
     assert held_apart(flat(0.0, 0.0), 0.02) == {}

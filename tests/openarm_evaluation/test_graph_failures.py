@@ -13,6 +13,8 @@ from openarm_interfaces.srv import SaveRecording
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.campaign.ros.graph import keep_recording
 
+pytestmark = pytest.mark.requirement("N-24")
+
 ROW = {
     "set": "nominal",
     "seed": 10003,
@@ -44,7 +46,6 @@ class Absent:
         raise OpenArmError(Code.NOT_READY, "no service /flight_recorder/save within 10 s")
 
 
-@pytest.mark.requirement("N-24")
 def test_the_recording_of_a_task_is_next_to_its_reason_and_says_how_to_repeat_it(tmp_path: Path) -> None:
     recorder, folder = Recorder(tmp_path), tmp_path / "failures" / "10003"
     keep_recording(recorder, ROW, folder)  # type: ignore[arg-type]
@@ -56,7 +57,6 @@ def test_the_recording_of_a_task_is_next_to_its_reason_and_says_how_to_repeat_it
     assert {"set: nominal", "seed: 10003", "scene_hash: abc", f"again: {ROW['again']}"} <= set(lines)
 
 
-@pytest.mark.requirement("N-24")
 def test_a_campaign_goes_on_without_a_flight_recorder(tmp_path: Path) -> None:
     keep_recording(Absent(), ROW, tmp_path / "1")  # type: ignore[arg-type]
     assert {path.name for path in (tmp_path / "1").iterdir()} == {"row.json", "reason.txt", "no_recording.txt"}

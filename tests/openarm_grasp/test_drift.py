@@ -16,6 +16,8 @@ from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import DriftConfig, GraspConfig
 from openarm_grasp.evidence.drift import DriftWatch
 
+pytestmark = pytest.mark.requirement("N-06")
+
 
 def watched(bias: tuple[float, float], noise: float, n: int = 10, seed: int = 0) -> DriftWatch:
     rng = np.random.default_rng(seed)
@@ -40,7 +42,6 @@ def of_both(biases: dict[str, tuple[float, float]], noise: float, seed: int) -> 
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.requirement("N-06")
 def test_a_bias_of_8_mm_is_found_and_named_within_10_grasps(seed):
     drift = watched((0.008, 0.0), 0.002, seed=seed).drift()
     assert drift.alarm
@@ -50,17 +51,14 @@ def test_a_bias_of_8_mm_is_found_and_named_within_10_grasps(seed):
 
 
 @pytest.mark.parametrize("seed", range(20))
-@pytest.mark.requirement("N-06")
 def test_noise_alone_raises_no_alarm(seed):
     assert not watched((0.0, 0.0), 0.003, seed=seed).drift().alarm
 
 
-@pytest.mark.requirement("N-06")
 def test_few_grasps_say_nothing():
     assert not watched((0.008, 0.0), 0.001, n=4).drift().alarm
 
 
-@pytest.mark.requirement("N-06")
 def test_old_grasps_are_forgotten():
     watch = watched((0.008, 0.0), 0.001)
     for k in range(10):
@@ -69,7 +67,6 @@ def test_old_grasps_are_forgotten():
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.requirement("N-06")
 def test_arms_that_differ_are_said_with_both_causes(seed):
     drift = of_both({"left": (0.008, 0.0), "right": (-0.008, 0.006)}, 0.001, seed).drift()
     assert drift.alarm
@@ -78,7 +75,6 @@ def test_arms_that_differ_are_said_with_both_causes(seed):
 
 
 @pytest.mark.parametrize("seed", range(20))
-@pytest.mark.requirement("N-06")
 def test_what_is_wrong_with_the_camera_is_no_difference_of_the_arms(seed):
     drift = of_both({"left": (0.008, -0.004), "right": (0.008, -0.004)}, 0.001, seed).drift()
     assert drift.alarm
@@ -86,7 +82,6 @@ def test_what_is_wrong_with_the_camera_is_no_difference_of_the_arms(seed):
     assert "calibrate it again" in drift.message
 
 
-@pytest.mark.requirement("N-06")
 def test_arms_that_measured_different_directions_are_not_compared():
     watch = DriftWatch(DriftConfig(), "overhead")
     for _ in range(5):
@@ -97,7 +92,6 @@ def test_arms_that_measured_different_directions_are_not_compared():
 
 
 @pytest.mark.long
-@pytest.mark.requirement("N-06")
 def test_grasps_with_a_mount_8_mm_off_raise_the_alarm() -> None:
     camera = load_cameras()["overhead"]
     believed = se3.make(p=(0.006, 0.0053, 0.0)) @ camera.T_parent_link

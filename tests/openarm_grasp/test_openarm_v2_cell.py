@@ -17,11 +17,11 @@ from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.task import Task as GraspTask
 from openarm_grasp.strategies.registry import carry_out
 
+pytestmark = [pytest.mark.long, pytest.mark.requirement("R-05")]
+
 FAR = {"name": "red_cube", "shape": "box", "size": [0.05] * 3, "color": "red", "mass": 0.1, "position": [0.52, -0.36]}
 
 
-@pytest.mark.long
-@pytest.mark.requirement("R-05")
 @pytest.mark.parametrize(("camera", "label", "side"), [("ceiling", "blue", "left"), ("head_left", "red", "right")])
 def test_it_places_an_object_of_its_scene(monkeypatch: pytest.MonkeyPatch, camera: str, label: str, side: str) -> None:
     """`head_left` has no depth of its own: it is matched with `head_right`."""
@@ -34,8 +34,6 @@ def test_it_places_an_object_of_its_scene(monkeypatch: pytest.MonkeyPatch, camer
     assert f"observing with the {side}_wrist camera" in " ".join(step.reason for step in trials.steps)
 
 
-@pytest.mark.long
-@pytest.mark.requirement("R-05")
 def test_where_nothing_is_in_reach_the_lift_goes_to_another_height(monkeypatch: pytest.MonkeyPatch) -> None:
     """It starts too high for what is that far; the way is planned first, and a dry run moves nothing."""
     monkeypatch.setenv(ROBOT, "openarm_v2_cell")
@@ -53,8 +51,6 @@ def test_where_nothing_is_in_reach_the_lift_goes_to_another_height(monkeypatch: 
     assert trials.skills.lift_position() < high - 0.05
 
 
-@pytest.mark.long
-@pytest.mark.requirement("R-05")
 def test_arms_that_touch_the_cell_are_said_so_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the lift at its top no arm can move: no other route is planned from there."""
     monkeypatch.setenv(ROBOT, "openarm_v2_cell")

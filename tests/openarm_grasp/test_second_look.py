@@ -20,6 +20,8 @@ from openarm_grasp.requests.task import Status
 from openarm_grasp.robot.interface import Frames, PlanGrasp
 from tests.openarm_grasp.scripted import Follow
 
+pytestmark = pytest.mark.requirement("A-35")
+
 CUBE = SceneObject(name="red_cube", shape="box", size=(0.06, 0.06, 0.05), color="red", position=(0.27, -0.22), yaw=0.3)
 
 
@@ -53,7 +55,6 @@ def hand_target(trials: Trials, status: Status) -> np.ndarray:
 
 
 @pytest.mark.long
-@pytest.mark.requirement("A-35")
 def test_the_second_look_removes_the_error_of_the_first() -> None:
     _, _, coarse = grasp(enabled=False, off=(0.009, 0.008))
     trials, row, fine = grasp(enabled=True, off=(0.009, 0.008))
@@ -66,7 +67,6 @@ def test_the_second_look_removes_the_error_of_the_first() -> None:
 
 
 @pytest.mark.parametrize("what", ["nothing", "another", "failed", "no plan"])
-@pytest.mark.requirement("A-35")
 def test_a_second_look_that_does_not_help_changes_nothing(what: str, worlds, box) -> None:
     world = worlds(box("red", 0.26, -0.2), near={"enabled": True})
     real = world.observe
@@ -90,7 +90,6 @@ def test_a_second_look_that_does_not_help_changes_nothing(what: str, worlds, box
     assert [call.trajectory for call in world.done(Follow)][:2] == ["transfer", "approach"]
 
 
-@pytest.mark.requirement("A-35")
 def test_a_second_look_corrects_the_grasp_before_the_hand_goes_down(worlds, box) -> None:
     world = worlds(box("red", 0.26, -0.2), near={"enabled": True})
     real = world.observe

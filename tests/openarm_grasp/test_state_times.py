@@ -10,6 +10,8 @@ from openarm_grasp.requests.state_times import StateClock
 from openarm_grasp.requests.states import State
 from tests.openarm_grasp.scripted import Follow
 
+pytestmark = pytest.mark.requirement("N-19")
+
 S = State
 
 
@@ -18,7 +20,6 @@ def clock(*entries: tuple[State, float, bool]) -> tuple[StateClock, list[str]]:
     return made, [made.enter(state, round(t * 1e9), waits=waits) for state, t, waits in entries]
 
 
-@pytest.mark.requirement("N-19")
 def test_a_visit_goes_on_while_its_state_is_entered_again():
     made, said = clock((S.DETECT, 0.0, False), (S.PLAN, 1.0, False), (S.PLAN, 2.5, False), (S.RESET, 3.5, False))
     assert said == ["", "", "", "PLAN took 2.5 s, expected at most 2 s"]
@@ -28,7 +29,6 @@ def test_a_visit_goes_on_while_its_state_is_entered_again():
     assert (reset.state, reset.duration) == ("RESET", 1.0)
 
 
-@pytest.mark.requirement("N-19")
 def test_two_short_visits_exceed_no_budget_and_a_long_one_is_told_once():
     made, said = clock((S.PLAN, 0.0, False), (S.DETECT, 1.5, False), (S.PLAN, 2.0, False), (S.LIFT, 3.5, False))
     assert said == [""] * 4
@@ -38,7 +38,6 @@ def test_two_short_visits_exceed_no_budget_and_a_long_one_is_told_once():
     assert [bool(text) for text in said] == [False, True, False, False]
 
 
-@pytest.mark.requirement("N-19")
 def test_the_time_that_a_person_takes_to_confirm_is_no_delay_of_the_state():
     made, said = clock((S.PLAN, 0.0, False), (S.PLAN, 1.0, True), (S.LIFT, 61.0, False))
     assert said == [""] * 3
@@ -46,7 +45,6 @@ def test_the_time_that_a_person_takes_to_confirm_is_no_delay_of_the_state():
     assert (plan.duration, plan.longest) == pytest.approx((61.0, 1.0))
 
 
-@pytest.mark.requirement("N-19")
 def test_the_answer_breaks_down_the_time_and_what_is_late_is_said(worlds, box):
     world, warned = worlds(box("red", 0.26, -0.2), budget={"lift": 3.0}), []
     world.warn = warned.append
@@ -64,7 +62,6 @@ def test_the_answer_breaks_down_the_time_and_what_is_late_is_said(worlds, box):
     assert lift.budget == 3.0
 
 
-@pytest.mark.requirement("N-19")
 def test_the_end_of_a_request_says_its_code(world):
     world.slips = 99
     assert world.status == []

@@ -10,7 +10,7 @@ from openarm_interfaces.srv import Grasp
 from openarm_common.errors import Code
 from openarm_grasp.ros.client import GraspClient, GraspResult
 
-pytestmark = pytest.mark.requirement("P-20", "R-25")
+pytestmark = [pytest.mark.requirement("P-20", "R-25"), pytest.mark.long]
 
 PARTS = ["transfer", "approach", "lift", "carry", "put down", "leave"]
 
@@ -47,7 +47,6 @@ def path_of(bench, trajectory) -> list[tuple[float, float, float]]:
     return [tuple(T[:3, 3].tolist()) for T in poses]
 
 
-@pytest.mark.long
 def test_what_is_executed_is_what_was_shown_last_and_others_are_served_meanwhile(bench):
     answered = bench.service.call_async(Grasp.Request(label="red", confirm=True))
     overtaken = waiting(bench).plan_id
@@ -77,7 +76,6 @@ def test_what_is_executed_is_what_was_shown_last_and_others_are_served_meanwhile
     assert (late.success, late.code) == (False, "NOT_READY")
 
 
-@pytest.mark.long
 def test_the_client_asks_its_caller(bench):
     asked: list[GraspStatus] = []
 
