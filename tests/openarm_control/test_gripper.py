@@ -65,9 +65,13 @@ def test_the_finger_reaches_its_goal(position: float) -> None:
     assert outcome.position == pytest.approx(position, abs=0.001)
 
 
+@pytest.fixture
+def finger() -> Finger:
+    return Finger()
+
+
 @pytest.mark.requirement("B-53")
-def test_closing_takes_six_tenths_of_a_second() -> None:
-    finger = Finger()
+def test_closing_takes_six_tenths_of_a_second(finger: Finger) -> None:
     finger.start(0.0)
     finger.run()
     assert (finger.t_ns - START) / 1e9 == pytest.approx(0.66, abs=0.06)
@@ -107,22 +111,19 @@ def test_a_hinge_moves_its_finger_as_a_slide_does(lever: float) -> None:
     assert outcomes[0].position * lever == pytest.approx(slide.outcomes[0].position)
 
 
-def test_effort_is_limited_as_asked_and_by_the_gripper() -> None:
-    finger = Finger()
+def test_effort_is_limited_as_asked_and_by_the_gripper(finger: Finger) -> None:
     for asked, limit in ((10.0, 10.0), (100.0, 30.0), (0.0, 30.0), (-5.0, 30.0)):
         finger.start(0.0, max_effort=asked)
         assert finger.follower.effort_limit == limit
 
 
-def test_velocity_is_limited_as_asked() -> None:
-    finger = Finger()
+def test_velocity_is_limited_as_asked(finger: Finger) -> None:
     finger.start(0.0, max_velocity=0.022)
     finger.run()
     assert (finger.t_ns - START) / 1e9 == pytest.approx(2.05, abs=0.1)
 
 
-def test_cancel_stops_the_ramp() -> None:
-    finger = Finger()
+def test_cancel_stops_the_ramp(finger: Finger) -> None:
     finger.start(0.0)
     finger.tick(20)
     finger.follower.cancel()
@@ -132,8 +133,7 @@ def test_cancel_stops_the_ramp() -> None:
     assert finger.targets[-1] == pytest.approx(held, abs=0.002)
 
 
-def test_a_new_gripper_goal_takes_over() -> None:
-    finger = Finger()
+def test_a_new_gripper_goal_takes_over(finger: Finger) -> None:
     finger.start(0.0)
     finger.tick(5)
     finger.start(0.044)
@@ -141,8 +141,7 @@ def test_a_new_gripper_goal_takes_over() -> None:
     assert finger.run().reached_goal
 
 
-def test_a_finger_that_never_rests_times_out() -> None:
-    finger = Finger()
+def test_a_finger_that_never_rests_times_out(finger: Finger) -> None:
     finger.start(0.02)
     for i in range(600):
         finger.update(0.03, 0.01 * (-1) ** i, 0.0)
@@ -163,8 +162,7 @@ def test_bad_gripper_goals_are_refused_with_joint_and_value(kwargs: dict, code: 
     assert refused(message, Finger().follower.check, GripperGoal(**kwargs)).code is code
 
 
-def test_rests_on_the_way_do_not_add_up_to_a_stall() -> None:
-    finger = Finger()
+def test_rests_on_the_way_do_not_add_up_to_a_stall(finger: Finger) -> None:
     finger.start(0.0)
     finger.tick(100)
     finger.start(0.0, max_effort=5.0)

@@ -61,18 +61,11 @@ class Bench:
 
     def __init__(self) -> None:
         servos = ServoModel(np.array([50.0]), np.array([2.0]), np.zeros(1), np.zeros(1), np.zeros(1))
-        config = TrajectoryConfig()
+        config, effort = TrajectoryConfig(), {"right": np.inf}
         start = JointReadout(0, np.zeros(2), np.zeros(2), np.zeros(2))
         carriers = {"right": Carrier(servos, config.carrier)}
         self.controller = RobotController(
-            {"right": ARM},
-            {"right": GRIPPER},
-            ("j1", "f1"),
-            start,
-            {"right": np.inf},
-            config,
-            GripperConfig(),
-            carriers,
+            {"right": ARM}, {"right": GRIPPER}, ("j1", "f1"), start, effort, config, GripperConfig(), carriers
         )
         self.robot = Robot()
         self.loop = StreamedRobot(self.controller, self.robot, 0.2, lambda _: None)
@@ -91,6 +84,12 @@ class Bench:
         trajectory = Trajectory(ARM.names, np.array([0.0, seconds]), np.array([state.position, [q]]))
         follower = self.controller.arms["right"]
         follower.start(follower.check(trajectory), state.t_ns, state.position, self.ends.append)
+
+    def sets_out(self, ticks: int, *, q: float = 0.9, seconds: float = 2.0) -> None:
+        """Begin a motion, and be under way for some ticks."""
+        self.ticks(2)
+        self.go(q, seconds)
+        self.ticks(ticks)
 
 
 @pytest.fixture
@@ -159,9 +158,7 @@ def test_every_tick_of_a_motion_is_a_command(bench: Bench) -> None:
 
 def test_after_a_pause_of_the_process_a_motion_goes_on_where_it_was(bench: Bench) -> None:
     """Not where it would be by now: that would be a blow. It is in time again soon after."""
-    bench.ticks(2)
-    bench.go(0.9, seconds=1.0)
-    bench.ticks(30)
+    bench.sets_out(30, seconds=1.0)
     bench.robot.t_ns += 8 * PERIOD_NS
     bench._wall_ns += 8 * PERIOD_NS
     before = len(bench.robot.commands)
@@ -173,9 +170,7 @@ def test_after_a_pause_of_the_process_a_motion_goes_on_where_it_was(bench: Bench
 
 @pytest.mark.requirement("P-23")
 def test_joint_states_that_cease_end_the_goal_and_nothing_more_is_commanded(bench: Bench) -> None:
-    bench.ticks(2)
-    bench.go(0.9, seconds=2.0)
-    bench.ticks(50)
+    bench.sets_out(50)
     bench.robot.silent = True
     bench.ticks(22)
     assert bench.ends[0].end is End.ABORTED
@@ -190,9 +185,7 @@ def test_joint_states_that_cease_end_the_goal_and_nothing_more_is_commanded(benc
 
 
 def test_an_arm_that_is_put_elsewhere_is_held_there(bench: Bench) -> None:
-    bench.ticks(2)
-    bench.go(0.9, seconds=2.0)
-    bench.ticks(10)
+    bench.sets_out(10)
     bench.robot.at = np.array([-0.7, 0.02])
     bench.ticks(1)
     assert "j1 jumped by" in bench.ends[0].text
@@ -215,9 +208,7 @@ def test_a_hand_is_closed_on_something_when_its_fingers_stop_before_the_end(benc
 
 
 def test_a_robot_that_takes_no_commands_says_why_and_begins_where_it_is_then(bench: Bench) -> None:
-    bench.ticks(2)
-    bench.go(0.9, seconds=2.0)
-    bench.ticks(50)
+    bench.sets_out(50)
     bench.robot.refuses = "the arm one_3 sinks"
     before = len(bench.robot.commands)
     bench.ticks(20)
@@ -230,9 +221,7 @@ def test_a_robot_that_takes_no_commands_says_why_and_begins_where_it_is_then(ben
 
 
 def test_the_emergency_stop_holds_the_command(bench: Bench) -> None:
-    bench.ticks(2)
-    bench.go(0.9, seconds=2.0)
-    bench.ticks(50)
+    bench.sets_out(50)
     bench.loop.stop_motion()
     held = bench.robot.commands[-1].copy()
     bench.ticks(50)

@@ -68,8 +68,13 @@ def moves(world: World) -> list[object]:
     return [call for kind in (Follow, Grip, GoHome, MoveLinear) for call in world.done(kind)]
 
 
-def test_the_plan_that_is_shown_and_confirmed_is_executed_and_no_other() -> None:
-    world = World(standing("red", 0.3, -0.2))
+@pytest.fixture
+def world() -> World:
+    """A red cube on the right, alone."""
+    return World(standing("red", 0.3, -0.2))
+
+
+def test_the_plan_that_is_shown_and_confirmed_is_executed_and_no_other(world: World) -> None:
 
     def nothing_has_moved(world: World, status: Status) -> None:
         assert moves(world) == []
@@ -85,8 +90,7 @@ def test_the_plan_that_is_shown_and_confirmed_is_executed_and_no_other() -> None
     assert is_executed(world, *shown)
 
 
-def test_a_rejected_plan_ends_with_cancelled_and_nothing_has_moved() -> None:
-    world = World(standing("red", 0.3, -0.2))
+def test_a_rejected_plan_ends_with_cancelled_and_nothing_has_moved(world: World) -> None:
     shown = watched(world, reject)
     outcome = world.grasp(confirm=True)
     assert (outcome.code, outcome.kind, outcome.attempts) == (Code.CANCELLED, "CANCELLED", 0)
@@ -94,8 +98,7 @@ def test_a_rejected_plan_ends_with_cancelled_and_nothing_has_moved() -> None:
     assert moves(world) == []
 
 
-def test_only_the_plan_that_waits_can_be_answered() -> None:
-    world = World(standing("red", 0.3, -0.2))
+def test_only_the_plan_that_waits_can_be_answered(world: World) -> None:
     gate = world.session.gate
     assert refused("no plan waits", gate.answer, "x", accept=True).code is Code.NOT_READY
 
@@ -183,8 +186,7 @@ def test_another_attempt_is_asked_about_again() -> None:
     assert len(world.followed) == 2
 
 
-def test_a_place_that_is_planned_anew_is_asked_about_again() -> None:
-    world = World(standing("red", 0.3, -0.2))
+def test_a_place_that_is_planned_anew_is_asked_about_again(world: World) -> None:
     shown = watched(world)
     report = world.on_report
 
@@ -204,8 +206,7 @@ def test_a_place_that_is_planned_anew_is_asked_about_again() -> None:
     assert all(a is b for a, b in zip(world.followed, done, strict=True))
 
 
-def test_each_phase_is_asked_about() -> None:
-    world = World(standing("red", 0.3, -0.2))
+def test_each_phase_is_asked_about(world: World) -> None:
     shown = watched(world)
     world.succeeds(phase="pick", confirm=True)
     assert [names(plan) for plan in shown] == [["transfer", "approach", "lift"]]
@@ -214,8 +215,7 @@ def test_each_phase_is_asked_about() -> None:
     assert is_executed(world, *shown)
 
 
-def test_a_rejected_place_leaves_the_object_in_the_hand() -> None:
-    world = World(standing("red", 0.3, -0.2))
+def test_a_rejected_place_leaves_the_object_in_the_hand(world: World) -> None:
     assert world.grasp(phase="pick").success
     done = len(world.followed)
     watched(world, reject)
@@ -225,8 +225,7 @@ def test_a_rejected_place_leaves_the_object_in_the_hand() -> None:
     assert "right" in world.session.kept
 
 
-def test_a_cancel_ends_the_wait() -> None:
-    world = World(standing("red", 0.3, -0.2))
+def test_a_cancel_ends_the_wait(world: World) -> None:
 
     def cancel(world: World, status: Status) -> None:
         world.stopped = Code.CANCELLED
@@ -237,8 +236,7 @@ def test_a_cancel_ends_the_wait() -> None:
     refused("no plan waits", world.session.gate.answer, "x", accept=True)
 
 
-def test_a_dry_run_asks_nobody() -> None:
-    world = World(standing("red", 0.3, -0.2))
+def test_a_dry_run_asks_nobody(world: World) -> None:
     shown = watched(world)
     assert world.grasp(confirm=True, dry_run=True).success
     assert (shown, moves(world)) == ([], [])

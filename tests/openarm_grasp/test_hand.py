@@ -61,15 +61,18 @@ def test_a_robot_without_the_finger_is_named(robot):
     refused("no openarm_right_finger_joint1; it has other", HandReader(robot, states, "right").gap)
 
 
-def test_no_joint_state_yet_is_not_silence():
-    silence = Silence(0.2)
+@pytest.fixture
+def silence() -> Silence:
+    return Silence(0.2)
+
+
+def test_no_joint_state_yet_is_not_silence(silence):
     for i in range(100):
         silence.update(i * 0.1, -1)
     silence.check(1.0)
 
 
-def test_a_second_without_a_new_stamp_is_a_lost_robot():
-    silence = Silence(0.2)
+def test_a_second_without_a_new_stamp_is_a_lost_robot(silence):
     silence.update(0.0, 5 * MS)
     for i in range(1, 11):
         silence.update(i * 0.1, 5 * MS)
@@ -78,22 +81,19 @@ def test_a_second_without_a_new_stamp_is_a_lost_robot():
     assert refused(r"silent for 1\.1 s", silence.check, 1.05).code is Code.ROBOT_LOST
 
 
-def test_a_new_stamp_ends_the_silence():
-    silence = Silence(0.2)
+def test_a_new_stamp_ends_the_silence(silence):
     for i in range(30):
         silence.update(i * 0.1, i * MS)
         silence.check(0.15)
 
 
-def test_a_starved_process_does_not_take_its_own_pause_for_silence():
-    silence = Silence(0.2)
+def test_a_starved_process_does_not_take_its_own_pause_for_silence(silence):
     silence.update(0.0, MS)
     silence.update(30.0, MS)
     silence.check(1.0)
 
 
-def test_robot_time_that_goes_back_is_a_restarted_robot():
-    silence = Silence(0.2)
+def test_robot_time_that_goes_back_is_a_restarted_robot(silence):
     silence.update(0.0, 100 * MS)
     silence.update(0.1, 2 * MS)
     silence.update(0.2, 3 * MS)

@@ -48,9 +48,14 @@ def test_an_object_goes_from_hand_to_hand_by_way_of_the_middle(robot) -> None:
     assert abs(y) <= middle.abs_y
 
 
+@pytest.fixture
+def two(robot) -> World:
+    """A red cube on the right side, that only the right arm reaches."""
+    return robot(0.25, -0.30)
+
+
 @pytest.mark.requirement("P-12")
-def test_a_taker_that_fails_leaves_a_partial_result_that_says_where_the_object_is(robot) -> None:
-    two = robot(0.25, -0.30)
+def test_a_taker_that_fails_leaves_a_partial_result_that_says_where_the_object_is(two: World) -> None:
     two.fail(lambda e: isinstance(e, Follow) and e.arm == "left" and e.trajectory == "approach",
                    Code.EXECUTION_FAILED)  # fmt: skip
     outcome = two.ask(place=(0.25, 0.30))
@@ -99,8 +104,7 @@ def shy_taker(two: World, times: int) -> None:
 
 
 @pytest.mark.requirement("P-12")
-def test_a_taker_that_is_refused_after_all_gets_the_object_elsewhere(robot) -> None:
-    two = robot(0.25, -0.30)
+def test_a_taker_that_is_refused_after_all_gets_the_object_elsewhere(two: World) -> None:
     shy_taker(two, 1)
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.code, outcome.route, outcome.arm) == (Code.OK, "hand_over", "left")
@@ -121,9 +125,8 @@ def test_it_is_brought_to_the_middle_as_often_as_the_parameter_says(robot) -> No
 
 
 @pytest.mark.requirement("P-12")
-def test_without_another_way_the_answer_says_both(robot) -> None:
+def test_without_another_way_the_answer_says_both(two: World) -> None:
     """From the middle the right arm cannot lift it again."""
-    two = robot(0.25, -0.30)
     shy_taker(two, 9)
     reaches = two.reaches
 
@@ -139,8 +142,7 @@ def test_without_another_way_the_answer_says_both(robot) -> None:
 
 
 @pytest.mark.requirement("P-12")
-def test_a_giver_that_fails_never_calls_the_taker(robot) -> None:
-    two = robot(0.25, -0.30)
+def test_a_giver_that_fails_never_calls_the_taker(two: World) -> None:
     two.fail(lambda e: isinstance(e, Follow) and e.trajectory == "approach", Code.EXECUTION_FAILED)
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.kind, outcome.code) == ("FAILED", Code.EXECUTION_FAILED)
@@ -164,16 +166,14 @@ def test_an_arm_that_was_asked_for_is_not_replaced(robot) -> None:
 
 
 @pytest.mark.requirement("P-12")
-def test_a_dry_run_reports_the_route_and_moves_nothing(robot) -> None:
-    two = robot(0.25, -0.30)
+def test_a_dry_run_reports_the_route_and_moves_nothing(two: World) -> None:
     outcome = two.ask(place=(0.25, 0.30), dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "hand_over")
     assert "the right arm brings it to the middle" in outcome.message
     assert not [e for _, e in two.log if isinstance(e, Follow | Grip | GoHome)]
 
 
-def test_cancel_between_the_parts_ends_the_whole(robot) -> None:
-    two = robot(0.25, -0.30)
+def test_cancel_between_the_parts_ends_the_whole(two: World) -> None:
     two.on_report = lambda status: setattr(two, "stopped", Code.CANCELLED if "another way" in status.reason else None)
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.kind, outcome.code) == ("CANCELLED", Code.CANCELLED)

@@ -103,10 +103,14 @@ def test_what_cannot_be_taken_is_listed_with_place_and_reason():
     assert "anything at (0.200, 0.000) m: IN_COLLISION: lowest has no room" in order.faults()
 
 
+@pytest.fixture
+def order() -> Order:
+    return Order(("anything",))
+
+
 @pytest.mark.requirement("R-17")
-def test_what_no_hand_takes_is_pushed_aside_for_what_it_hides():
+def test_what_no_hand_takes_is_pushed_aside_for_what_it_hides(order):
     heap = Heap(HEAP, {}, never=("top",), hidden={"lowest": "top", "middle": "top"}, yields=("top",))
-    order = Order(("anything",))
     heap.clear(order)
     assert heap.taken == ["lowest", "middle"]
     assert heap.aside.count("top") == 1 + 3  # uncovers both; then in vain, until it is given up
@@ -144,16 +148,14 @@ def test_what_a_hand_still_holds_is_put_down_before_anything_else():
     assert (ask.phase, ask.exclude_near) == ("all", ((0.22, -0.26), (0.3, 0.1)))
 
 
-def test_a_hand_that_cannot_let_go_ends_the_order():
-    order = Order(("anything",))
+def test_a_hand_that_cannot_let_go_ends_the_order(order):
     order.done(order.next(), Code.PLACE_FAILED, "the hand keeps it", seen=(0.3, 0.0), touched=True, held=True)
     order.done(order.next(), Code.PLACE_FAILED, "no free spot", touched=True, held=True)
     assert order.next() is None
     assert order.faults()[-1] == "anything: PLACE_FAILED: no free spot"
 
 
-def test_what_was_let_go_elsewhere_is_asked_for_again():
-    order = Order(("anything",))
+def test_what_was_let_go_elsewhere_is_asked_for_again(order):
     order.done(order.next(), Code.GRASP_LOST, "it has turned", seen=(0.3, 0.0), touched=True, held=True)
     order.done(order.next(), Code.PLACE_FAILED, "let go where it met something", seen=(0.2, 0.1), touched=True)
     assert order.next() == GraspRequest("easiest anything", exclude_near=((0.3, 0.0), (0.2, 0.1)))
@@ -310,8 +312,7 @@ def test_an_order_ends_though_things_seem_to_stand_elsewhere_each_time():
 
 @pytest.mark.requirement("R-17", "P-02")
 @pytest.mark.parametrize("touched", [False, True])
-def test_what_is_not_seen_any_more_where_it_was_left_stays_on_the_list(touched):
-    order = Order(("anything",))
+def test_what_is_not_seen_any_more_where_it_was_left_stays_on_the_list(order, touched):
     order.done(order.next(), Code.OK, "", placed=(0.3, 1.0), seen=(0.3, 0.1, 0.4))
     order.done(order.next(), Code.IN_COLLISION, "no room", seen=(0.26, 0.0, 0.4))
     order.done(order.next(), Code.UNKNOWN_OBJECT, "no more")
@@ -347,8 +348,7 @@ def test_an_order_that_has_taken_what_it_was_asked_for_leaves_nothing():
 
 
 @pytest.mark.requirement("R-17")
-def test_what_a_push_has_moved_out_of_sight_does_not_end_an_order():
-    order = Order(("anything",))
+def test_what_a_push_has_moved_out_of_sight_does_not_end_an_order(order):
     for x in (0.2, 0.3):
         order.done(order.next(), Code.IN_COLLISION, "no room", seen=(x, 0.1, 0.4))
     order.done(order.next(), Code.UNKNOWN_OBJECT, "no more")
@@ -375,8 +375,7 @@ def test_what_is_not_at_its_place_may_be_a_part_of_something_that_is_seen_whole_
 
 
 @pytest.mark.requirement("R-17", "P-02")
-def test_what_is_seen_for_a_moment_does_not_keep_for_good_from_what_it_is_a_part_of():
-    order = Order(("anything",))
+def test_what_is_seen_for_a_moment_does_not_keep_for_good_from_what_it_is_a_part_of(order):
     order.done(order.next(), Code.IN_COLLISION, "no room", seen=(0.30, 0.08, 0.4))
     order.done(order.next(), Code.OK, "", placed=(0.3, 1.0), seen=(0.33, -0.1, 0.4))
     order.done(order.next(), Code.UNKNOWN_OBJECT, "not there at the second look", seen=(0.40, 0.18, 0.4))

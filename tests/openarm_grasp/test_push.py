@@ -13,12 +13,17 @@ from openarm_common.errors import Code
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.pushes import closed_hand, push_ways
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
-from tests.openarm_grasp.scripted import Follow, Grip
+from tests.openarm_grasp.scripted import Follow, Grip, World
+
+
+@pytest.fixture
+def two(robot) -> World:
+    """A red cube out of the reach of both arms."""
+    return robot(0.46, 0.02, far=0.44)
 
 
 @pytest.mark.requirement("N-13", "A-65")
-def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(robot) -> None:
-    two = robot(0.46, 0.02, far=0.44)
+def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(two: World) -> None:
     outcome = two.ask()
     assert (outcome.code, outcome.route) == (Code.OK, "push")
     assert two.pushed == 1
@@ -30,8 +35,7 @@ def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(robot) -> 
 
 
 @pytest.mark.requirement("N-13")
-def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_object_now(robot) -> None:
-    two = robot(0.46, 0.02, far=0.44)
+def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_object_now(two: World) -> None:
     plan, ahead = two.plan, list[PlanGrasp]()
 
     async def noted(effect: PlanGrasp | PlanPlace) -> Planned:
@@ -49,8 +53,7 @@ def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_obj
 
 
 @pytest.mark.requirement("N-13")
-def test_a_push_that_the_object_does_not_follow_goes_another_way_next_and_is_reported(robot) -> None:
-    two = robot(0.46, 0.02, far=0.44)
+def test_a_push_that_the_object_does_not_follow_goes_another_way_next_and_is_reported(two: World) -> None:
     two.follows = 0.1
     outcome = two.ask()
     assert two.pushed == 2  # no third way leads into reach
@@ -62,9 +65,8 @@ def test_a_push_that_the_object_does_not_follow_goes_another_way_next_and_is_rep
 
 
 @pytest.mark.requirement("N-13")
-def test_the_camera_verifies_a_push(robot) -> None:
+def test_the_camera_verifies_a_push(two: World) -> None:
     """Half of the way is seen as half of the way, and the rest is pushed again."""
-    two = robot(0.46, 0.02, far=0.44)
     two.follows = 0.5
     outcome = two.ask()
     assert outcome.code is Code.OK
@@ -80,8 +82,7 @@ def test_after_a_push_the_object_is_looked_for_where_it_was_pushed_to_not_where_
 
 
 @pytest.mark.requirement("N-13")
-def test_an_object_that_is_lost_in_a_push_is_reported(robot) -> None:
-    two = robot(0.46, 0.02, far=0.44)
+def test_an_object_that_is_lost_in_a_push_is_reported(two: World) -> None:
     push = two.push
     two.push = lambda: (push(), two.objects.pop("red"))
     outcome = two.ask()
@@ -89,16 +90,14 @@ def test_an_object_that_is_lost_in_a_push_is_reported(robot) -> None:
     assert outcome.code in (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT)
 
 
-def test_a_hand_that_meets_something_behind_the_object_does_not_push(robot) -> None:
-    two = robot(0.46, 0.02, far=0.44)
+def test_a_hand_that_meets_something_behind_the_object_does_not_push(two: World) -> None:
     two.tcp_error = 0.02
     outcome = two.ask()
     assert (outcome.kind, outcome.code) == ("FAILED", Code.HAND_COLLISION)
     assert two.pushed == 0
 
 
-def test_what_can_neither_be_grasped_nor_pushed_is_refused_with_both_reasons(robot) -> None:
-    two = robot(0.46, 0.02, far=0.44)
+def test_what_can_neither_be_grasped_nor_pushed_is_refused_with_both_reasons(two: World) -> None:
     two.hands_come_behind = False
     outcome = two.ask()
     assert (outcome.kind, outcome.code) == ("REFUSED", Code.UNREACHABLE)
@@ -118,8 +117,7 @@ def test_what_is_thinner_than_the_hand_comes_down_to_can_not_be_pushed(robot, he
 
 
 @pytest.mark.requirement("N-13")
-def test_a_dry_run_of_a_push_moves_nothing(robot) -> None:
-    two = robot(0.46, 0.02, far=0.44)
+def test_a_dry_run_of_a_push_moves_nothing(two: World) -> None:
     outcome = two.ask(dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "push")
     assert not two.done(Follow)

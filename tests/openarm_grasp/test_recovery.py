@@ -25,8 +25,7 @@ from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Wait
 @pytest.mark.requirement("A-70")
 def test_a_miss_opens_backs_off_and_tries_another_way(world):
     world.slips = 1
-    outcome = world.succeeds()
-    assert outcome.attempts == 2
+    assert world.succeeds().attempts == 2
     missed = world.log[world.log.index(next(x for x in world.log if world.grips(opening=False)(x[1]))) :]
     kinds = [type(e) for _, e in missed[3:8]]  # pause, measure
     assert kinds == [Grip, Wait, MoveLinear, GoHome, GoHome]
@@ -58,14 +57,12 @@ def test_without_an_object_the_grasp_fails(worlds, box):
     """The object disappears after its detection: three attempts at most, never a success."""
     world = worlds(box("red", 0.26, -0.2))
     world.faults.append(lambda e: world.objects.clear() if isinstance(e, PlanGrasp) else None)
-    outcome = world.ends(Code.GRASP_MISSED, "nothing is in view")
-    assert outcome.attempts == 1
+    assert world.ends(Code.GRASP_MISSED, "nothing is in view").attempts == 1
 
 
 def test_three_misses_end_with_a_named_refusal_open_hand_and_home(world):
     world.slips = 99
-    outcome = world.ends(Code.GRASP_MISSED)
-    assert outcome.attempts == 3
+    assert world.ends(Code.GRASP_MISSED).attempts == 3
     assert world.gap == pytest.approx(0.088)
     moved = [call for _, call in world.log if isinstance(call, (Follow, GoHome, MoveLinear))]
     assert isinstance(moved[-1], GoHome)
@@ -99,8 +96,7 @@ def test_an_object_that_moves_before_the_hand_goes_down_is_not_touched(world, bo
             moved.append(world.objects.update(red=box("red", 0.30, -0.2)))
 
     world.faults.append(nudge)
-    outcome = world.succeeds()
-    assert outcome.attempts == 2
+    assert world.succeeds().attempts == 2
     assert len(world.times(world.follows_path("approach"))) == 1  # the first hand did not go down
     assert world.done(PlanGrasp)[1].candidates[0].T_base_tcp[0, 3] == pytest.approx(0.30)
 
@@ -133,8 +129,7 @@ def test_an_alarm_that_the_look_from_home_does_not_confirm_is_raised_once(world,
         return Frames(tuple(Frame(frame.t_ns, (shifted,)) for frame in found.frames), "base")
 
     world.frames = frames
-    outcome = world.succeeds()
-    assert outcome.attempts == 2
+    assert world.succeeds().attempts == 2
 
 
 @pytest.mark.requirement("P-09")
@@ -142,8 +137,7 @@ def test_an_object_that_has_fallen_over_is_reported(world, box):
     """It stands at its target, lower than it was: nothing that the hand could try again would right it."""
     world.objects["red"] = box("red", 0.26, -0.2, size=0.06)
     # the scripted hand puts down cubes of 50 mm
-    outcome = world.ends(Code.PLACE_FAILED, "has fallen over: it is 50 mm high there and was 60 mm")
-    assert outcome.attempts == 1
+    assert world.ends(Code.PLACE_FAILED, "has fallen over: it is 50 mm high there and was 60 mm").attempts == 1
 
 
 @pytest.mark.requirement("P-08")
@@ -164,16 +158,14 @@ def test_lost_on_the_way_is_found_again(world, box):
         return OpenArmError(Code.GRASP_LOST, "dropped by injection")
 
     world.faults.append(drop_once)
-    outcome = world.succeeds()
-    assert outcome.attempts == 2
+    assert world.succeeds().attempts == 2
 
 
 # --- placing
 @pytest.mark.requirement("P-09")
 def test_a_place_that_is_not_seen_within_2_cm_is_tried_again(world):
     world.place_error = 0.03
-    outcome = world.ends(Code.PLACE_FAILED, "30 mm from its target")
-    assert outcome.attempts == 3
+    assert world.ends(Code.PLACE_FAILED, "30 mm from its target").attempts == 3
 
 
 def test_a_place_that_cannot_be_planned_puts_the_object_back(world):
@@ -186,8 +178,7 @@ def test_a_place_that_cannot_be_planned_puts_the_object_back(world):
 
 def test_a_carry_that_was_blocked_puts_the_object_back_and_tries_again(world):
     world.fail(world.follows_path("carry"), Code.EXECUTION_FAILED, times=1)
-    outcome = world.succeeds()
-    assert outcome.attempts == 2
+    assert world.succeeds().attempts == 2
     first, _, second = world.done(PlanPlace)
     assert first.targets[0].position != pytest.approx(second.targets[0].position)
 
@@ -320,8 +311,7 @@ def test_what_meets_something_just_above_its_place_is_let_go_there(world, above,
 
     world.T_base_tcp = hand
     world.fail(world.follows_path("put down"), Code.EXECUTION_FAILED, times=1)
-    outcome = world.succeeds()
-    assert outcome.attempts == (1 if let_go else 2)
+    assert world.succeeds().attempts == (1 if let_go else 2)
 
 
 @pytest.mark.requirement("R-17")
@@ -351,8 +341,7 @@ def test_what_a_hand_kept_is_let_go_where_it_meets_something_and_taken_from_ther
 
     world.T_base_tcp = hand
     world.fail(world.follows_path("put down"), Code.EXECUTION_FAILED, times=1)
-    outcome = world.succeeds(phase="place")
-    assert outcome.attempts == 2
+    assert world.succeeds(phase="place").attempts == 2
     assert not world.session.kept
     assert any("50 mm above its place" in status.reason for status in world.status)
 

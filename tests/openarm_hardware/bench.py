@@ -122,8 +122,10 @@ class Bench:
             self.tick()
         raise AssertionError(f"{self.phases}, expected {phases}: {self.machine.text}")
 
-    def up(self) -> Bench:
-        """Bring both arms up."""
+    def up(self, *, carried: bool = False) -> Bench:
+        """Bring both arms up; their client may carry the weights."""
+        if carried:
+            self.client = self.carried
         self.until([Phase.FOLLOWING, Phase.FOLLOWING], 3.0)
         return self
 

@@ -57,8 +57,13 @@ def test_arms_come_up_where_they_are(start: float, weight: float) -> None:
     assert max(abs(motor.dq) for motor in bench.motors if not motor.axis.grips) < 0.4
 
 
-def test_commands_are_joined_by_lines_and_followed() -> None:
-    bench = Bench().up()
+@pytest.fixture
+def bench() -> Bench:
+    """Both arms are up."""
+    return Bench().up()
+
+
+def test_commands_are_joined_by_lines_and_followed(bench: Bench) -> None:
     start, since = bench.q(), bench.now_ns
 
     def wave() -> list[tuple[float, float]]:
@@ -80,13 +85,10 @@ def test_commands_are_joined_by_lines_and_followed() -> None:
 
 
 def test_a_silent_motor_stops_its_arm_softly_and_the_other_one_holds() -> None:
-    bench = Bench(weight=1.0, silent=3)
-    bench.client = bench.carried
-    bench.up()
+    bench = Bench(weight=1.0, silent=3).up(carried=True)
     held = bench.q()[8:15]
     bench.buses.inject("silent", "one_3")
-    cycles = bench.until(HALF, 0.1)
-    assert cycles <= 4  # 3 replies left out and the one that was under way
+    assert bench.until(HALF, 0.1) <= 4  # 3 replies left out and the one that was under way
     assert "one_3 (motor 0x03 of unix:a) has left out 3 replies" in bench.machine.text
     assert bench.kp(0) == [0.0] * 7
     assert min(bench.kp(1)) > 9.9
@@ -112,11 +114,9 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("fault", "joint", "value", "phases", "text"), FAULTS)
-def test_a_fault_is_named_latched_and_reset_when_it_is_gone(fault, joint, value, phases, text) -> None:
-    bench = Bench().up()
+def test_a_fault_is_named_latched_and_reset_when_it_is_gone(bench: Bench, fault, joint, value, phases, text) -> None:
     bench.buses.inject(fault, joint, value)
-    cycles = bench.until(phases, 0.2)
-    assert cycles <= 6
+    assert bench.until(phases, 0.2) <= 6
     assert text in bench.machine.text
     bench.run(0.5)
     assert bench.phases == phases
@@ -136,8 +136,7 @@ def test_a_fault_is_named_latched_and_reset_when_it_is_gone(fault, joint, value,
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, 0.8, -0.8])
-def test_a_command_that_jumps_is_not_followed(wrong: float) -> None:
-    bench = Bench().up()
+def test_a_command_that_jumps_is_not_followed(bench: Bench, wrong: float) -> None:
     before = bench.q()
     good = bench.client
     assert good is not None
@@ -162,8 +161,7 @@ def test_commands_beyond_the_limits_end_at_them() -> None:
     assert max(q for q, a in zip(bench.q(), bench.axes, strict=True) if not a.grips) < 2.25
 
 
-def test_a_frozen_encoder_is_found_when_the_arm_moves() -> None:
-    bench = Bench().up()
+def test_a_frozen_encoder_is_found_when_the_arm_moves(bench: Bench) -> None:
     bench.buses.inject("freeze", "one_4")
     bench.move(0.5)
     bench.until([Phase.DAMPED, Phase.HELD], 0.3)
@@ -208,8 +206,7 @@ def test_a_joint_that_is_blocked_is_found_by_its_distance_from_the_command() -> 
     assert "off its command" in bench.machine.text
 
 
-def test_without_fresh_commands_the_arms_hold_and_go_on_with_the_next() -> None:
-    bench = Bench().up()
+def test_without_fresh_commands_the_arms_hold_and_go_on_with_the_next(bench: Bench) -> None:
     good, bench.client = bench.client, None
     before = bench.q()
     bench.run(2.0)
@@ -221,8 +218,7 @@ def test_without_fresh_commands_the_arms_hold_and_go_on_with_the_next() -> None:
     assert bench.machine.text == ""
 
 
-def test_a_command_that_is_old_when_it_comes_is_not_followed() -> None:
-    bench = Bench().up()
+def test_a_command_that_is_old_when_it_comes_is_not_followed(bench: Bench) -> None:
     away = tuple((q if axis.grips else q + 0.3, t) for (q, t), axis in zip(bench.here(), bench.axes, strict=True))
     before, bench.client = bench.q(), None
     bench.run(1.0)
@@ -233,8 +229,7 @@ def test_a_command_that_is_old_when_it_comes_is_not_followed() -> None:
     assert bench.q() == pytest.approx(before, abs=0.002)
 
 
-def test_a_reply_of_a_register_that_comes_late_is_no_position() -> None:
-    bench = Bench().up()
+def test_a_reply_of_a_register_that_comes_late_is_no_position(bench: Bench) -> None:
     late = [
         (axis.reply_id, frames.register_reply(axis.id, *register, written=False))
         for axis, motor in zip(bench.axes[:8], bench.motors[:8], strict=True)
@@ -256,9 +251,7 @@ def test_a_gear_divides_the_speed_and_multiplies_the_torque() -> None:
 
 @pytest.mark.requirement("B-55")
 def test_the_emergency_stop_holds_at_once_with_the_weight_carried() -> None:
-    bench = Bench(weight=1.0)
-    bench.client = bench.carried
-    bench.up()
+    bench = Bench(weight=1.0).up(carried=True)
     bench.move(0.5)
     bench.run(0.5)
     torque = [s.command_tau for s in bench.machine.motors()]
@@ -276,8 +269,7 @@ def test_the_emergency_stop_holds_at_once_with_the_weight_carried() -> None:
 
 
 def test_a_zero_that_jumped_is_refused_by_name_until_somebody_has_looked() -> None:
-    last = {"one_2": 1.2, "two_2": 0.3}
-    bench = Bench(last=last)
+    bench = Bench(last={"one_2": 1.2, "two_2": 0.3})
     bench.run(0.3)
     assert bench.phases[0] is Phase.REFUSED
     assert "one_2" in bench.machine.text
@@ -316,9 +308,7 @@ def test_lost_and_late_replies_are_no_false_alarm() -> None:
 
 
 def test_the_end_lets_arms_sink_and_switches_them_off() -> None:
-    bench = Bench(weight=1.0)
-    bench.client = bench.carried
-    bench.up()
+    bench = Bench(weight=1.0).up(carried=True)
     bench.machine.release("the client has ended", bench.now_ns)
     fastest = 0.0
     while not bench.machine.ended:

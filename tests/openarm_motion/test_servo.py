@@ -89,8 +89,12 @@ def towards(direction, speed=0.4):
     return np.concatenate([speed * np.asarray(direction, dtype=float) / np.abs(direction).max(), np.zeros(3)])
 
 
-def test_a_twist_moves_the_tool_as_it_says(arms, home):
-    bench = Bench(arms, home)
+@pytest.fixture
+def bench(arms, home) -> Bench:
+    return Bench(arms, home)
+
+
+def test_a_twist_moves_the_tool_as_it_says(bench):
     before = bench.tool("right")
 
     for _ in range(40):
@@ -140,8 +144,7 @@ def test_at_full_speed_towards_the_table_an_arm_slows_and_what_it_holds_stops_ov
     assert bench.tool("right")[2] > top
 
 
-def test_arms_sent_towards_each_other_stop_apart(arms, home):
-    bench = Bench(arms, home)
+def test_arms_sent_towards_each_other_stop_apart(bench):
 
     for _ in range(150):
         way = bench.tool("left") - bench.tool("right")
@@ -151,8 +154,7 @@ def test_arms_sent_towards_each_other_stop_apart(arms, home):
     assert Status.HALT_FOR_COLLISION in bench.said["right"] | bench.said["left"]
 
 
-def test_a_joint_stops_before_its_limit(arms, home):
-    bench = Bench(arms, home)
+def test_a_joint_stops_before_its_limit(bench, arms):
     velocity = np.zeros(7)
     velocity[4] = 0.5
 
@@ -186,8 +188,7 @@ def test_set_points_keep_velocity_acceleration_and_jerk(arms, home):
     assert np.all(np.abs(np.diff(a, axis=0)) <= 1e-3 * limits.jerk * 1.01)
 
 
-def test_when_commands_cease_the_set_point_begins_to_slow_within_50_ms_and_every_trajectory_ends_at_rest(arms, home):
-    bench = Bench(arms, home)
+def test_when_commands_cease_the_set_point_begins_to_slow_within_50_ms_and_every_trajectory_ends_at_rest(bench):
     velocity = np.zeros(7)
     velocity[4] = 0.3
     for _ in range(60):
@@ -205,8 +206,7 @@ def test_when_commands_cease_the_set_point_begins_to_slow_within_50_ms_and_every
     assert all(np.all(motion.v[-1] == 0.0) for motion, _ in bench.sent["right"])
 
 
-def test_a_stretched_arm_stops_at_the_singular_posture_and_comes_back(arms, home):
-    bench = Bench(arms, home)
+def test_a_stretched_arm_stops_at_the_singular_posture_and_comes_back(bench):
     for _ in range(250):
         bench.tick({"right": towards(np.array([1.0, -0.2, 0.3]))})
     assert bench.said["right"] & {Status.HALT_FOR_SINGULARITY, Status.JOINT_BOUND}
@@ -218,8 +218,7 @@ def test_a_stretched_arm_stops_at_the_singular_posture_and_comes_back(arms, home
     assert np.linalg.norm(bench.tool("right") - out) > 0.03
 
 
-def test_an_arm_that_does_not_follow_gets_no_set_points_until_commands_pause(arms, home):
-    bench = Bench(arms, home)
+def test_an_arm_that_does_not_follow_gets_no_set_points_until_commands_pause(bench, arms):
     velocity = np.zeros(7)
     velocity[4] = 0.5
     bench.stuck.add("right")

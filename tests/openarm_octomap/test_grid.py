@@ -109,10 +109,14 @@ def test_a_cloud_gives_the_same_map_as_its_image(accumulated, reference) -> None
     np.testing.assert_array_equal(grid.blocks.log_odds(), accumulated.blocks.log_odds())
 
 
+@pytest.fixture
+def grid() -> OccupancyGrid:
+    return OccupancyGrid(GridConfig(**SMALL))
+
+
 @pytest.mark.requirement("A-55", "A-56")
-def test_what_arrives_is_marked_and_what_leaves_is_cleared_in_one_frame_each() -> None:
+def test_what_arrives_is_marked_and_what_leaves_is_cleared_in_one_frame_each(grid: OccupancyGrid) -> None:
     """Also after it stood there for a minute: clearing is as quick as marking."""
-    grid = OccupancyGrid(GridConfig(**SMALL))
     empty, box = floor(), floor(box=(slice(20, 28), slice(28, 36), 890))
     at = [(0.0, 0.0, 0.11)]
     for i in range(120):
@@ -146,9 +150,8 @@ def test_frames_to_mark_and_to_clear_are_what_they_say(mark: int, clear: int) ->
     assert frames_until(empty, FREE) == clear
 
 
-def test_two_cameras_in_one_update_a_hit_of_either_counts() -> None:
+def test_two_cameras_in_one_update_a_hit_of_either_counts(grid: OccupancyGrid) -> None:
     """One looks past the box, the other at it."""
-    grid = OccupancyGrid(GridConfig(**SMALL))
     both = [scan(floor(box=(slice(20, 28), slice(28, 36), 890))), scan(floor())]
     for order in (both, both[::-1]):
         grid.reset()
@@ -171,8 +174,7 @@ def test_views_into_the_distance_clear_and_a_switch_keeps_them_from_it() -> None
     assert update.cleared == 0
 
 
-def test_robot_pixels_clear_up_to_the_robot_and_mark_nothing() -> None:
-    grid = OccupancyGrid(GridConfig(**SMALL))
+def test_robot_pixels_clear_up_to_the_robot_and_mark_nothing(grid: OccupancyGrid) -> None:
     patch = (slice(20, 28), slice(28, 36))
     label = np.zeros((48, 64), np.uint8)
     label[patch] = 1
@@ -186,8 +188,7 @@ def test_robot_pixels_clear_up_to_the_robot_and_mark_nothing() -> None:
 
 
 @pytest.mark.requirement("P-06")
-def test_boxes_are_cleared_to_free_or_to_unknown_and_bad_ones_are_refused() -> None:
-    grid = OccupancyGrid(GridConfig(**SMALL))
+def test_boxes_are_cleared_to_free_or_to_unknown_and_bad_ones_are_refused(grid: OccupancyGrid) -> None:
     grid.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 0)
     point = [(0.0, 0.0, 0.11)]
     grid.clear_box((-0.05, -0.05, 0.05), (0.05, 0.05, 0.2))
@@ -200,9 +201,8 @@ def test_boxes_are_cleared_to_free_or_to_unknown_and_bad_ones_are_refused() -> N
 
 
 @pytest.mark.requirement("A-75")
-def test_coarse_queries_keep_what_is_occupied() -> None:
+def test_coarse_queries_keep_what_is_occupied(grid: OccupancyGrid) -> None:
     """A cell of 4, 8, 16 cm is occupied when a part of it is; centres lie on OctoMap's lattice of that edge."""
-    grid = OccupancyGrid(GridConfig(**SMALL))
     grid.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 0)
     fine = grid.lattice.centres(np.argwhere(grid.blocks.states() == OCCUPIED))
     for depth in (16, 15, 14, 13):
@@ -301,9 +301,8 @@ def test_no_image_harms_the_map(data) -> None:
 GRID = OccupancyGrid(GridConfig(lower=(-0.2, -0.2, -0.2), upper=(0.2, 0.2, 0.2)))
 
 
-def test_points_that_are_not_finite_mark_nothing() -> None:
+def test_points_that_are_not_finite_mark_nothing(grid: OccupancyGrid) -> None:
     """A NaN is no voxel at the base of the robot."""
-    grid = OccupancyGrid(GridConfig(**SMALL))
     points = np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [1e9, 0, 0]], np.float32)
     update = grid.integrate([CloudScan(points, np.array([0.1, 0.0, 0.3]))], 0)
     assert (update.valid, update.ends, grid.counts()["occupied"]) == (0, 0, 0)

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import math
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -45,6 +47,12 @@ def make_controller() -> tuple[World, RobotController]:
     return world, controllers_of(world, TrajectoryConfig(), GripperConfig())
 
 
+def tick(world: World, controller: RobotController, n: int = 1) -> None:
+    for _ in range(n):
+        world.set_targets(controller.update(world.read_joints(), world.period_ns))
+        world.step(world.steps_per_tick)
+
+
 def controllers_of(world: World, config: TrajectoryConfig, gripper: GripperConfig) -> RobotController:
     servos = ServoModel(np.array([200.0]), np.array([4.0]), np.zeros(1), np.zeros(1), np.zeros(1))
     carriers = {"right": Carrier(servos, config.carrier)}
@@ -61,9 +69,12 @@ class Bench:
         self.world, self.controller = make_controller()
         self.states: list[tuple[float, JointReadout]] = []
         self._changed = threading.Condition()
-        self.simulation = Simulation(
-            SimulatedRobot(RobotDescription.load(), self.world, self.controller), self._observe, speed=speed
-        )
+        robot = SimulatedRobot(RobotDescription.load(), self.world, self.controller)
+        self.simulation = Simulation(robot, self._observe, speed=speed)
+
+    def do(self, work: Callable[[], object]) -> Any:
+        """What a call in the thread of the physics returns."""
+        return self.simulation.call(work).result(DEADLINE_S)
 
     def _observe(self, state: JointReadout) -> None:
         with self._changed:
@@ -99,6 +110,14 @@ class Clocked:
             self.now_ns += max(round(self.simulation._turn() * 1e9), 500_000)
 
 
+def keeps_pace(simulation: Simulation, share: float, ms: float) -> None:
+    """The world is as fast as the clock and its ticks take 10 ms, within these bounds."""
+    assert simulation.real_time_factor.value == pytest.approx(1.0, abs=share)
+    figures = simulation.periods.figures()
+    assert figures.n > 150
+    assert figures.p50_ms == pytest.approx(10.0, abs=ms)
+
+
 @pytest.mark.requirement("A-18", "A-19")
 def test_ticks_of_ten_milliseconds_keep_pace_with_the_clock() -> None:
     bench = Clocked()
@@ -106,10 +125,7 @@ def test_ticks_of_ten_milliseconds_keep_pace_with_the_clock() -> None:
     assert set(np.diff([state.t_ns for _, state in bench.states])) == {10_000_000}
     np.testing.assert_allclose(np.diff([now for now, _ in bench.states]), 0.01, atol=0.001)
     assert bench.world.t_ns == pytest.approx(2e9, abs=2e7)
-    assert bench.simulation.real_time_factor.value == pytest.approx(1.0, abs=0.01)
-    figures = bench.simulation.periods.figures()
-    assert figures.n > 150
-    assert figures.p50_ms == pytest.approx(10.0, abs=0.5)
+    keeps_pace(bench.simulation, 0.01, 0.5)
 
 
 @pytest.mark.parametrize("speed", [5.0, 1.5, 0.0])
@@ -139,20 +155,15 @@ def test_stamps_of_the_wall_clock_never_go_back_after_a_halt(monkeypatch: pytest
     monkeypatch.setattr("openarm_sim_bridge.simulation.time.time_ns", lambda: since + now[0])
     world, controller = make_controller()
     world.shift_time(since)
-    stamps: list[int] = []
-
-    def observe(state: JointReadout) -> None:
-        stamps.append(state.t_ns)
-
+    states: list[JointReadout] = []
     robot = SimulatedRobot(RobotDescription.load(), world, controller)
-    simulation = Simulation(robot, observe, wall_stamps=True, clock=lambda: now[0])
+    simulation = Simulation(robot, states.append, wall_stamps=True, clock=lambda: now[0])
     for turn in range(300):
         now[0] += max(round(simulation._turn() * 1e9), 100_000)
         if turn == 100:
             now[0] += halt_ms * 1_000_000
-    steps = np.diff(stamps)
-    assert steps.min() > 0
-    assert abs(since + now[0] - stamps[-1]) < 100_000_000
+    assert np.diff([state.t_ns for state in states]).min() > 0
+    assert abs(since + now[0] - states[-1].t_ns) < 100_000_000
 
 
 @pytest.fixture
@@ -171,10 +182,7 @@ def test_ticks_keep_pace_with_the_wall_clock(bench: Bench) -> None:
     (wall_0, first), (wall_1, last) = bench.states[50], bench.states[200]
     assert last.t_ns - first.t_ns == 1_500_000_000
     assert wall_1 - wall_0 == pytest.approx(1.5, rel=0.02)
-    assert bench.simulation.real_time_factor.value == pytest.approx(1.0, abs=0.05)
-    figures = bench.simulation.periods.figures()
-    assert figures.n > 150
-    assert figures.p50_ms == pytest.approx(10.0, abs=1.0)
+    keeps_pace(bench.simulation, 0.05, 1.0)
     # A window of two seconds: that the machine halts once is not the simulation's.
     bench.wait(lambda: p99(bench.states[-200:]) < 0.015)
 
@@ -187,29 +195,28 @@ def p99(states: list[tuple[float, JointReadout]]) -> float:
 @pytest.mark.requirement("P-25")
 def test_a_paused_world_stands_shows_life_and_steps(bench: Bench) -> None:
     bench.wait(lambda: len(bench.states) > 5)
-    bench.simulation.call(lambda: bench.simulation.set_paused(True)).result(DEADLINE_S)
+    bench.do(lambda: bench.simulation.set_paused(True))
     t_ns, n = bench.world.t_ns, len(bench.states)
     bench.wait(lambda: len(bench.states) > n + 2)
     assert bench.t_ns == t_ns
-    stepping = bench.simulation.call(lambda: bench.simulation.advance(13)).result(DEADLINE_S)
+    stepping = bench.do(lambda: bench.simulation.advance(13))
     assert stepping.result(DEADLINE_S) == t_ns + 13 * 2_000_000
     bench.wait(lambda: bench.t_ns == t_ns + 26_000_000)
-    bench.simulation.call(lambda: bench.simulation.set_paused(False)).result(DEADLINE_S)
+    bench.do(lambda: bench.simulation.set_paused(False))
     bench.wait(lambda: bench.t_ns > t_ns + 500_000_000)
 
 
 def test_steps_that_are_left_when_time_goes_on_are_not_said_to_be_done(bench: Bench) -> None:
     bench.wait(lambda: bench.states)
-    bench.simulation.call(lambda: bench.simulation.set_paused(True)).result(DEADLINE_S)
-    stepping = bench.simulation.call(lambda: bench.simulation.advance(10_000_000)).result(DEADLINE_S)
-    bench.simulation.call(lambda: bench.simulation.set_paused(False)).result(DEADLINE_S)
+    bench.do(lambda: bench.simulation.set_paused(True))
+    stepping = bench.do(lambda: bench.simulation.advance(10_000_000))
+    bench.do(lambda: bench.simulation.set_paused(False))
     assert refused("stepping ended early", stepping.result, DEADLINE_S).code is Code.CANCELLED
 
 
 def test_steps_are_refused_where_they_make_no_sense(bench: Bench) -> None:
     for steps, code in ((5, Code.NOT_READY), (0, Code.INVALID_ARGUMENT)):
-        with refuses(code):
-            bench.simulation.call(lambda n=steps: bench.simulation.advance(n)).result(DEADLINE_S)
+        assert refused(None, bench.do, lambda n=steps: bench.simulation.advance(n)).code is code
 
 
 def test_an_error_in_a_call_reaches_the_caller_and_not_the_thread(bench: Bench) -> None:
@@ -217,7 +224,7 @@ def test_an_error_in_a_call_reaches_the_caller_and_not_the_thread(bench: Bench) 
         raise ValueError("wrong")
 
     with pytest.raises(ValueError, match="wrong"):
-        bench.simulation.call(fail).result(DEADLINE_S)
+        bench.do(fail)
     n = len(bench.states)
     bench.wait(lambda: len(bench.states) > n + 3)
 
@@ -231,19 +238,17 @@ def test_a_diverged_world_stands_until_it_is_reset(
     outcomes: list[TrajectoryOutcome] = []
     arm, state = bench.controller.arms["right"], bench.states[-1][1]
     goal = arm.check(Trajectory(("j1",), np.array([5.0]), np.array([[0.6]])))
-    bench.simulation.call(lambda: arm.start(goal, bench.world.t_ns, state.position[:1], outcomes.append)).result(
-        DEADLINE_S
-    )
+    bench.do(lambda: arm.start(goal, bench.world.t_ns, state.position[:1], outcomes.append))
     bench.simulation.check_able()
 
     def diverge() -> None:
-        bench.simulation.call(lambda: bench.world.data.qvel.fill(np.nan)).result(DEADLINE_S)
+        bench.do(lambda: bench.world.data.qvel.fill(np.nan))
         deadline = time.monotonic() + DEADLINE_S
         while not bench.simulation.fault:
             assert time.monotonic() < deadline
-            bench.simulation.call(lambda: None).result(DEADLINE_S)
+            bench.do(lambda: None)
         assert "diverged" in bench.simulation.fault
-        bench.simulation.call(lambda: None).result(DEADLINE_S)  # the tick has ended
+        bench.do(lambda: None)  # the tick has ended
 
     diverge()
     assert outcomes[0].end is End.ABORTED
@@ -258,7 +263,7 @@ def test_a_diverged_world_stands_until_it_is_reset(
         assert len(data["t_ns"]) == len(data["position"]) == len(data["target"]) > 30
         assert np.all(np.diff(data["t_ns"]) == 10_000_000)
 
-    bench.simulation.call(lambda: bench.simulation.restart(bench.world.reset)).result(DEADLINE_S)
+    bench.do(lambda: bench.simulation.restart(bench.world.reset))
     t_ns = bench.world.t_ns
     bench.wait(lambda: bench.t_ns > t_ns + 50_000_000)
     assert np.all(np.isfinite(bench.states[-1][1].position))
@@ -309,15 +314,12 @@ def test_bad_commands_are_refused_with_joint_and_value(
 def test_commands_for_a_joint_that_follows_a_goal_are_reported() -> None:
     world, controller = make_controller()
     arm = controller.arms["right"]
-    arm.start(
-        arm.check(Trajectory(("j1",), np.array([0.5]), np.array([[0.6]]))), world.t_ns, np.zeros(1), lambda _o: None
-    )
+    goal = arm.check(Trajectory(("j1",), np.array([0.5]), np.array([[0.6]])))
+    arm.start(goal, world.t_ns, np.zeros(1), lambda _o: None)
     command = controller.check_command(["f1", "j1"], [0.02, -0.3])
     assert controller.busy(command) == ("j1",)
     controller.command(command)
-    for _ in range(150):
-        world.set_targets(controller.update(world.read_joints(), world.period_ns))
-        world.step(world.steps_per_tick)
+    tick(world, controller, 150)
     np.testing.assert_allclose(world.read_joints().position, [0.6, 0.02], atol=0.01)
 
 
@@ -333,8 +335,7 @@ def test_stale_commands_hold() -> None:
         for i in range(round(seconds * 100)):
             if i == 0 or (again and i % 20 == 0):
                 controller.command(controller.check_command(["j1", "f1"], [0.9, 0.04]))
-            world.set_targets(controller.update(world.read_joints(), world.period_ns))
-            world.step(world.steps_per_tick)
+            tick(world, controller)
             out.append(float(world.read_joints().position[0]))
         return out
 
@@ -352,9 +353,7 @@ def test_a_trajectory_needs_no_stream() -> None:
     controller.command(controller.check_command(["j1"], [0.1]))
     arm = controller.arms["right"]
     arm.start(arm.check(Trajectory(("j1",), np.array([1.5]), np.array([[0.6]]))), 0, np.zeros(1), lambda _o: None)
-    for _ in range(180):
-        world.set_targets(controller.update(world.read_joints(), world.period_ns))
-        world.step(world.steps_per_tick)
+    tick(world, controller, 180)
     assert world.read_joints().position[0] == pytest.approx(0.6, abs=0.01)
 
 
@@ -373,19 +372,13 @@ def test_targets_stand_in_the_order_of_the_world_and_reset_holds() -> None:
 
 def test_a_fault_of_the_program_in_the_thread_is_reported() -> None:
     world, controller = make_controller()
-    errors: list[Exception] = []
-    ended = threading.Event()
-
-    def crashed(error: Exception) -> None:
-        errors.append(error)
-        ended.set()
+    errors: queue.Queue[Exception] = queue.Queue()
 
     def observe(_state: JointReadout) -> None:
         raise ZeroDivisionError("a fault")
 
-    simulation = Simulation(SimulatedRobot(RobotDescription.load(), world, controller), observe, crashed=crashed)
+    simulation = Simulation(SimulatedRobot(RobotDescription.load(), world, controller), observe, crashed=errors.put)
     simulation.start()
-    assert ended.wait(DEADLINE_S)
+    assert isinstance(errors.get(timeout=DEADLINE_S), ZeroDivisionError)
     simulation.stop()
-    assert isinstance(errors[0], ZeroDivisionError)
     assert "a fault" in simulation.fault

@@ -55,9 +55,13 @@ def make(extra: str = BALL.format(z=0.05), objects: tuple[SceneObject, ...] = (B
     return World(spec(extra), joint_names=JOINTS, home=HOME, objects=objects, **kwargs)
 
 
+@pytest.fixture
+def world() -> World:
+    return make()
+
+
 @pytest.mark.requirement("A-22")
-def test_joint_index_uses_qposadr_with_free_body_first() -> None:
-    world = make()
+def test_joint_index_uses_qposadr_with_free_body_first(world: World) -> None:
     assert world.model.joint("shoulder").qposadr[0] == 7
     state = world.read_joints()
     np.testing.assert_allclose(state.position, [-0.3, 0.8, 0.02])
@@ -83,8 +87,7 @@ def test_a_time_step_that_does_not_divide_the_tick_is_refused() -> None:
 
 
 @pytest.mark.requirement("A-21")
-def test_targets_move_joints_by_force_and_never_write_qpos() -> None:
-    world = make()
+def test_targets_move_joints_by_force_and_never_write_qpos(world: World) -> None:
     before = world.data.qpos.copy()
     world.set_targets(np.array([0.5, 0.2, 0.0]))
     np.testing.assert_array_equal(world.data.qpos, before)
@@ -128,8 +131,7 @@ def test_qpos_is_written_in_one_place_of_the_package_and_nothing_is_welded() -> 
     ]
 
 
-def test_effort_is_what_the_actuator_pushes() -> None:
-    world = make()
+def test_effort_is_what_the_actuator_pushes(world: World) -> None:
     world.set_targets(np.array([-0.3, 0.8, 0.04]))
     world.step(1)
     assert world.read_joints().effort[2] == pytest.approx(30.0)  # 2000 N/m x 0.02 m, limited
@@ -169,8 +171,7 @@ def test_reset_puts_everything_back_and_time_goes_on() -> None:
 
 
 @pytest.mark.requirement("P-25")
-def test_a_reset_may_start_elsewhere_and_the_next_one_is_at_home_again() -> None:
-    world = make()
+def test_a_reset_may_start_elsewhere_and_the_next_one_is_at_home_again(world: World) -> None:
     elsewhere = se3.make(None, (-0.4, 0.3, 0.05))
     world.reset({"finger": 0.03, "elbow": -0.2}, {"ball": elsewhere})
     np.testing.assert_allclose(world.read_joints().position, [-0.3, -0.2, 0.03])
@@ -183,8 +184,7 @@ def test_a_reset_may_start_elsewhere_and_the_next_one_is_at_home_again() -> None
 
 
 @pytest.mark.requirement("P-25")
-def test_a_start_that_overlaps_leaves_the_world_as_it_was() -> None:
-    world = make()
+def test_a_start_that_overlaps_leaves_the_world_as_it_was(world: World) -> None:
     for _ in range(3):
         world.step(world.steps_per_tick)
     model, qpos, qvel = world.model, world.data.qpos.copy(), world.data.qvel.copy()
@@ -200,8 +200,7 @@ def test_a_start_that_overlaps_leaves_the_world_as_it_was() -> None:
     np.testing.assert_array_equal(world.data.qvel, qvel)
 
 
-def test_exchange_loads_another_world_and_time_goes_on() -> None:
-    world = make()
+def test_exchange_loads_another_world_and_time_goes_on(world: World) -> None:
     world.step(world.steps_per_tick)
     world.exchange(world.compile(spec(extra=""), ()))
     assert world.t_ns == 10_000_000
@@ -209,8 +208,7 @@ def test_exchange_loads_another_world_and_time_goes_on() -> None:
     np.testing.assert_allclose(world.read_joints().position, [-0.3, 0.8, 0.02])
 
 
-def test_extend_keeps_the_state_of_everything_that_was_there() -> None:
-    world = make()
+def test_extend_keeps_the_state_of_everything_that_was_there(world: World) -> None:
     target = np.array([0.4, 0.1, 0.03])
     world.set_targets(target)
     for _ in range(30):
@@ -227,8 +225,7 @@ def test_extend_keeps_the_state_of_everything_that_was_there() -> None:
     assert world.data.ctrl[2] == target[0]
 
 
-def test_extend_refuses_what_overlaps_and_leaves_the_world_as_it_was() -> None:
-    world = make()
+def test_extend_refuses_what_overlaps_and_leaves_the_world_as_it_was(world: World) -> None:
     world.step(world.steps_per_tick)
     model, position = world.model, world.read_joints().position
     cube = CUBE.format(pos="0.5 0.06 .05")
@@ -239,10 +236,9 @@ def test_extend_refuses_what_overlaps_and_leaves_the_world_as_it_was() -> None:
 
 
 def test_a_diverged_simulation_is_reported_and_a_reset_mends_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a file there
-    world = make()
     world.data.qvel[8] = np.nan
     assert refused(r"diverged at 0\.010 s", world.step, world.steps_per_tick).code is Code.INTERNAL
     world.reset()
