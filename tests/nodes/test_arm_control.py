@@ -85,8 +85,7 @@ def test_a_soft_arm_is_near_to_its_path_all_the_way(bench: Bench) -> None:
 def test_the_same_motion_sent_to_the_robot_itself_is_a_blow(robot: Bench) -> None:
     """Two points, which such controllers do not join."""
     bench, before = robot, robot.position("openarm_right_joint2")
-    result = move(bench, "", 0.6, 2.0)
-    assert result.error_code == 0
+    assert move(bench, "", 0.6, 2.0).error_code == 0
     assert bench.position("openarm_right_joint2") - before > 0.4
     shoulder = bench.joints[-1].name.index("openarm_right_joint2")
     fastest = max(abs(message.velocity[shoulder]) for message in bench.joints)

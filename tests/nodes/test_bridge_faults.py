@@ -52,8 +52,7 @@ def test_friction_lowered(bench) -> None:
 
 def test_gripper_stuck(bench) -> None:
     bench.inject("gripper_stuck", "{side: right}")
-    result = bench.grip(0.03).result
-    assert not result.reached_goal
+    assert not bench.grip(0.03).result.reached_goal
     assert bench.position(FINGER) < 0.005
     bench.clear()
     bench.ros.spin_until(lambda: abs(bench.position(FINGER) - 0.03) < 0.002, what="the gripper to be free")

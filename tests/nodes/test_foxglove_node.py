@@ -176,8 +176,7 @@ def test_a_service_is_called_from_foxglove(ros, foxglove: Foxglove) -> None:
                 assert "serviceCallFailure" not in str(message.data), message.data
         raise AssertionError("no answer")
 
-    answer = deserialize_message(foxglove.run(call), Grasp.Response)
-    assert answer.message == "asked for red"
+    assert deserialize_message(foxglove.run(call), Grasp.Response).message == "asked for red"
 
 
 def test_the_meshes_of_the_description_are_served_and_no_other_file(ros, foxglove: Foxglove, tmp_path: Path) -> None:

@@ -136,8 +136,7 @@ def test_the_clouds_of_both_cameras_meet_within_5_mm_though_one_of_them_moves(mo
 @pytest.mark.requirement("A-46", "A-50", "A-51")
 def test_filters_hold_for_the_merged_cloud(moving) -> None:
     """One point a cell of 1 cm where both cameras look, also with outliers dropped."""
-    bench = moving(organised=False, **{"filter.voxel": 0.01, "filter.outliers": True})
-    cloud = bench.show()
+    cloud = moving(organised=False, **{"filter.voxel": 0.01, "filter.outliers": True}).show()
     points = points_from_cloud(cloud)
     cells = np.floor(points.astype(np.float64) / 0.01 + 1e-6)
     assert 5_000 < len(points) < 100_000

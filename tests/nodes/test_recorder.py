@@ -84,8 +84,7 @@ def test_what_is_recorded_is_replayed(ros, tmp_path: Path) -> None:
 
 
 def test_a_bag_takes_the_place_of_the_robot_and_of_nothing_else(ros, tmp_path: Path) -> None:
-    recorder = record(ros, tmp_path / "bag", 3)
-    assert recorder.recorded.counts["/chatter"] == 3
+    assert record(ros, tmp_path / "bag", 3).recorded.counts["/chatter"] == 3
     with open_bag(tmp_path / "bag") as bag:
         player = Player(bag, None, {}, clock=True)
 
@@ -110,8 +109,7 @@ def test_a_bag_takes_the_place_of_the_robot_and_of_nothing_else(ros, tmp_path: P
 
 
 def test_patterns_choose_topics(ros, tmp_path: Path) -> None:
-    recorder = record(ros, tmp_path / "bag", 3, ("/chat.*",))
-    assert recorder.topics == ["/chatter"]
+    assert record(ros, tmp_path / "bag", 3, ("/chat.*",)).topics == ["/chatter"]
     with pytest.raises(OpenArmError, match="no regular expression"):
         Recorder(0, tmp_path / "other", ("(",), {})
 

@@ -126,8 +126,7 @@ def graph(running: tuple[Graph, Context]) -> Iterator[Graph]:
 def test_topics_are_listed_echoed_measured_and_published(
     graph: Graph, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    listed = ros2.topic_list()
-    assert listed.data["topics"]["/ticks"] == "std_msgs/msg/String"
+    assert ros2.topic_list().data["topics"]["/ticks"] == "std_msgs/msg/String"
     echoed = ros2.echo("status", count=1)  # latched: it was published long before
     assert echoed.data["messages"] == [{"data": "ready"}]
     assert ros2.echo("steps", count=1).data["messages"] == [{"data": "down"}], "the newest of those that are kept"
@@ -284,8 +283,7 @@ def listens(monkeypatch: pytest.MonkeyPatch, enough: Callable[[Frames], object])
 def test_the_tree_of_frames_is_shown_and_drawn(graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     listens(monkeypatch, lambda frames: len(frames.edges) == 2)
     out = tmp_path / "tree.png"
-    tree = tf.tree(out=out)
-    assert tree.text.splitlines() == ["world", "  base", "    camera"]
+    assert tf.tree(out=out).text.splitlines() == ["world", "  base", "    camera"]
     assert cv2.imread(str(out)).shape[0] > 60
     assert tf.echo("world", "camera").data["position"] == [1.5, 0.0, 0.0]
     with pytest.raises(OpenArmError, match=r"ends in \.png, \.svg or \.pdf"):

@@ -146,8 +146,7 @@ def test_folders_that_are_no_bag_and_bags_that_exist_are_refused(tmp_path: Path)
 
 
 def test_a_definition_has_constants_arrays_and_bounds() -> None:
-    text = definition(interface("sensor_msgs/msg/JointState"))
-    assert "float64[] position" in text
+    assert "float64[] position" in definition(interface("sensor_msgs/msg/JointState"))
     assert "int64 CUBE=1" in definition(interface("visualization_msgs/msg/Marker"))
     with pytest.raises(OpenArmError, match="no_such_msgs"):
         interface("no_such_msgs/msg/Thing")

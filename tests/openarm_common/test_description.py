@@ -138,8 +138,7 @@ def test_tcp_equals_the_closed_form_and_the_left_arm_is_its_mirror_image(
 
 
 def test_world_positions_at_zero(description: RobotDescription) -> None:
-    zero = dict.fromkeys(description.joints, 0.0)
-    poses = description.link_poses(zero)
+    poses = description.link_poses(dict.fromkeys(description.joints, 0.0))
     for side, sign in (("right", -1.0), ("left", 1.0)):
         np.testing.assert_allclose(poses[f"openarm_{side}_hand_tcp"][:3, 3], [0, sign * 0.1535, 0.0819], atol=1e-9)
         np.testing.assert_allclose(poses[f"openarm_{side}_hand_tcp"][:3, :3], se3.rot_x(np.pi), atol=1e-9)

@@ -113,8 +113,7 @@ def test_without_collision_the_mesh_must_be_closed_and_coacd_there(tmp_path, mon
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder = write(tmp_path / "x", [box(0.05, 0.04, 0.03)], collision=False)
     monkeypatch.setitem(__import__("sys").modules, "coacd", None)
-    error = refused(folder, "install the extra `objects`")
-    assert error.code is Code.ENVIRONMENT
+    assert refused(folder, "install the extra `objects`").code is Code.ENVIRONMENT
     lines = (folder / "visual.obj").read_text().splitlines()
     (folder / "visual.obj").write_text("\n".join(lines[:-2]) + "\n")
     refused(folder, "visual.obj is open: .* of its edges have one triangle")
@@ -207,10 +206,8 @@ def test_a_slanted_box_falls_over_its_edge() -> None:
     low, high = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.02, np.array([0.07, 0.0])
     leaning = hull_part(np.concatenate([np.c_[low, np.zeros(4)], np.c_[low + high, np.full(4, 0.08)]]))
     assert leaning is not None
-    centre = mass_centre([leaning])
-    assert centre[0] > 0.02  # beyond its foot: it can't stand on it
-    heights = [round(side.height, 4) for side in resting_sides([leaning])]
-    assert 0.04 not in heights
+    assert mass_centre([leaning])[0] > 0.02  # beyond its foot: it can't stand on it
+    assert 0.04 not in [round(side.height, 4) for side in resting_sides([leaning])]
 
 
 def test_the_upright_box_of_an_object_follows_from_its_side() -> None:

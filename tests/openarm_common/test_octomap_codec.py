@@ -52,8 +52,7 @@ def test_one_voxel_is_thirty_two_bytes() -> None:
 
 def test_an_empty_map_has_no_bytes() -> None:
     """Readers remove the map then."""
-    empty = np.zeros(LATTICE.shape, np.uint8)
-    assert encode_states(LATTICE, empty).data.size == 0
+    assert encode_states(LATTICE, np.zeros(LATTICE.shape, np.uint8)).data.size == 0
     assert full(np.full(LATTICE.shape, np.nan, np.float32)).data.size == 0
     values, outside = decode(b"", 0.02, binary=True).on(LATTICE)
     assert outside == 0
@@ -78,8 +77,7 @@ def test_full_round_trip(seed: int) -> None:
     rng = np.random.default_rng(seed)
     levels = np.array([np.nan, -2.0, -0.405, 0.442, 3.5], np.float32)
     log_odds = levels[(states_of(seed) + rng.integers(0, 3)) % 5]
-    payload = full(log_odds)
-    values, outside = decode(payload.data, 0.02, binary=False).on(LATTICE)
+    values, outside = decode(full(log_odds).data, 0.02, binary=False).on(LATTICE)
     assert outside == 0
     np.testing.assert_array_equal(values, log_odds)
 

@@ -54,8 +54,7 @@ def test_demo_has_a_red_cube_for_the_right_arm_and_a_blue_can_for_the_left() -> 
 
 def test_an_object_stands_on_the_table_unless_the_scene_says_otherwise() -> None:
     table = robot_work().table.at(0.30)
-    standing = SceneObject(**cube())
-    assert standing.centre(table) == pytest.approx((0.3, -0.2, 0.325))
+    assert SceneObject(**cube()).centre(table) == pytest.approx((0.3, -0.2, 0.325))
     assert SceneObject(**cube(position=[0.3, -0.2, 0.5])).centre(table)[2] == 0.5
     turned = SceneObject(**cube(yaw=np.pi / 4)).outline()
     np.testing.assert_allclose(np.abs(turned - [0.3, -0.2]).max(axis=0), [0.05 / np.sqrt(2)] * 2)

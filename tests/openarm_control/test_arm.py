@@ -15,7 +15,7 @@ from openarm_common.robot.servos import ServoModel
 from openarm_control.arm import End, FollowerState, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
 from openarm_control.carrier import Carrier, CarrierConfig
 from openarm_control.follower import Tracker
-from openarm_control.trajectory import JointGroup, Trajectory, TrajectoryResult
+from openarm_control.trajectory import JointGroup, Trajectory, TrajectoryError, TrajectoryResult
 from tests.refusals import refused
 
 MS = 1_000_000
@@ -100,7 +100,8 @@ def test_a_start_far_from_the_arm_is_refused_with_joint_and_value(arm: Arm) -> N
 
 
 def test_a_first_point_that_cannot_be_reached_in_time_is_refused() -> None:
-    refused(r"j1 would have to move at 50\.00 rad/s to be at the first point", Arm().start, t=np.array([0.01]))
+    error = refused(r"j1 would have to move at 50\.00 rad/s to be at the first point", Arm().start, t=np.array([0.01]))
+    assert isinstance(error, TrajectoryError)
 
 
 def test_targets_lead_by_lag_times_velocity() -> None:
@@ -132,7 +133,7 @@ def test_a_trajectory_that_is_over_already_is_refused(arm: Arm) -> None:
 
 
 def test_a_stamp_of_another_clock_is_refused() -> None:
-    refused("use_sim_time", Arm().start, start_ns=1_700_000_000 * 1000 * MS)
+    assert isinstance(refused("use_sim_time", Arm().start, start_ns=1_700_000_000 * 1000 * MS), TrajectoryError)
 
 
 def test_a_joint_that_is_held_back_ends_the_goal_and_the_arm_holds_there() -> None:
@@ -171,8 +172,7 @@ def test_cancel_slows_down_along_the_path_and_holds(arm: Arm) -> None:
     arm.start(**CUBIC)
     arm.tick(50)
     arm.follower.cancel()
-    outcome = arm.run()
-    assert outcome.end is End.CANCELLED
+    assert arm.run().end is End.CANCELLED
     np.testing.assert_allclose(arm.q[0], -arm.q[1])  # still on the path
     assert 0.25 < arm.q[0] < 0.35
     held = arm.q.copy()

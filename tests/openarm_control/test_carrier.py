@@ -151,8 +151,7 @@ def test_what_presses_on_a_surface_is_not_pressed_harder_and_harder() -> None:
     bench.tick(30)
     dof = [bench.robot.world.model.joint(name).dofadr[0] for name in bench.follower.group.names]
     bench.robot.world.data.qfrc_applied[dof[3]] = -4.0
-    ended = bench.go(1.0)
-    assert ended.result is TrajectoryResult.SUCCESSFUL
+    assert bench.go(1.0).result is TrajectoryResult.SUCCESSFUL
     before = bench.robot.targets[ARM].copy()
     bench.tick(200)
     assert np.abs(bench.robot.targets[ARM] - before).max() < 0.02

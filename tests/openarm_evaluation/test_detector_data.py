@@ -25,12 +25,10 @@ def files(folder) -> dict[str, bytes]:
 @pytest.mark.long
 @pytest.mark.requirement("P-18", "B-68")
 def test_sets_are_the_same_for_a_seed_share_nothing_and_go_on_after_a_stop(tmp_path) -> None:
-    made = make_data(tmp_path / "a", SIZE)
-    assert made == {"train": 3, "select": 2, "report": 2}
+    assert make_data(tmp_path / "a", SIZE) == {"train": 3, "select": 2, "report": 2}
     first = files(tmp_path / "a")
     assert read_classes(tmp_path / "a") == SHAPES
-    pictures = [data for name, data in first.items() if name.endswith(".jpg")]
-    assert len(set(pictures)) == 7
+    assert len({data for name, data in first.items() if name.endswith(".jpg")}) == 7
     for name in first:
         if name.startswith("labels"):
             kinds, boxes = read_labels(first[name].decode(), 640, 480, len(SHAPES), name)

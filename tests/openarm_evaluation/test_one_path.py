@@ -57,8 +57,7 @@ def test_a_table_15_mm_higher_than_believed_is_refused_and_right_when_it_was_mea
 @pytest.mark.requirement("R-27")
 def test_parameters_are_those_that_the_supervisor_gives_the_nodes_and_set_changes_both(tmp_path: Path) -> None:
     sets = ("motion.planning.seed=7", "motion.map.use=required")
-    graph = load_graph("sim", sets=sets)
-    node_arguments(graph, "motion", tmp_path)
+    node_arguments(load_graph("sim", sets=sets), "motion", tmp_path)
     written = yaml.safe_load((tmp_path / "params" / "motion.yaml").read_text())["motion"]["ros__parameters"]
     motion = suite_config(sets).motion
     for name, value in written.items():

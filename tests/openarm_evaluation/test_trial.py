@@ -48,8 +48,7 @@ def test_scene_is_recognised_only_when_all_its_objects_rest_at_their_places() ->
 
 
 def test_scene_hash_distinguishes_scenes_and_is_stable() -> None:
-    hashes = {scene_hash(load_scene("random", seed)) for seed in range(20)}
-    assert len(hashes) == 20
+    assert len({scene_hash(load_scene("random", seed)) for seed in range(20)}) == 20
     assert scene_hash(load_scene("random", 5)) == scene_hash(load_scene("random", 5))
 
 

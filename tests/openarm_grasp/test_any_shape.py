@@ -68,8 +68,7 @@ def test_what_the_border_cuts_is_placed_when_all_of_it_is_seen_there(recorded: R
 
 def test_where_the_points_of_what_was_placed_are_is_remembered(recorded: Recordings) -> None:
     robot = recorded(alone("banana", 0.27, -0.22, 0.4))
-    outcome = robot.succeeds("anything")
-    place = tuple(outcome.place_position[:2])
+    place = tuple(robot.succeeds("anything").place_position[:2])
     near, (points,) = robot.session.parts_of((place,))
     assert near == ()
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -115,8 +114,7 @@ def test_among_other_things_the_place_is_planned_before_the_lift(recorded: Recor
         for name, y in (("banana", -0.20), ("apple", -0.38))
     ]
     table = load_scene("empty").table.model_dump()
-    scene = parse_scene({"name": "two", "table": table, "objects": items}, "two")
-    robot = recorded(scene)
+    robot = recorded(parse_scene({"name": "two", "table": table, "objects": items}, "two"))
     robot.succeeds()
     assert "planning the place" in robot.said
 

@@ -69,8 +69,7 @@ def test_candidates_of_any_box_lean_by_their_tilt_close_on_an_edge_and_come_alon
 @pytest.mark.requirement("B-46")
 def test_pregrasp_distance_of_6_cm_is_a_parameter():
     config = GraspConfig.model_validate({"approach": {"pregrasp_distance": 0.06}})
-    top_down = propose(box(), config, HAND)[0]
-    assert top_down.approach_offset[2] == pytest.approx(0.06)
+    assert propose(box(), config, HAND)[0].approach_offset[2] == pytest.approx(0.06)
 
 
 @pytest.mark.parametrize("value", [0.04, 0.09])

@@ -173,8 +173,7 @@ def test_another_attempt_is_asked_about_again() -> None:
     world = World(standing("red", 0.3, -0.2))
     world.slips = 1
     shown = watched(world)
-    outcome = world.succeeds(confirm=True)
-    assert (outcome.attempts, len(shown)) == (2, 2)
+    assert (world.succeeds(confirm=True).attempts, len(shown)) == (2, 2)
     first, second = shown
     assert first.id != second.id
     done = [part for _, part in (*first.parts[:2], *second.parts)]  # the way home after a failure needs no answer

@@ -58,8 +58,7 @@ def larger(**kwargs) -> Detection:
 )
 @pytest.mark.requirement("A-71")
 def test_grip_truth_table(changes, code, reason):
-    evidence = Evidence(**{**vars(GOOD), **changes})
-    verdict = judge_grip(evidence, HELD)
+    verdict = judge_grip(Evidence(**{**vars(GOOD), **changes}), HELD)
     assert verdict.code is code
     assert reason in verdict.reason
 

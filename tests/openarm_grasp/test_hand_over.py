@@ -13,8 +13,7 @@ from tests.openarm_grasp.scripted import OVER, Follow, GoHome, Grip, World
 
 @pytest.mark.requirement("P-11")
 def test_a_direct_request_goes_one_way_and_says_so(robot) -> None:
-    two = robot(0.25, 0.25)
-    outcome = two.ask(place=(0.25, 0.35))
+    outcome = robot(0.25, 0.25).ask(place=(0.25, 0.35))
     assert (outcome.code, outcome.route, outcome.arm, outcome.attempts) == (Code.OK, "direct", "left", 1)
 
 

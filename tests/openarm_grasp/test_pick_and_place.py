@@ -75,13 +75,11 @@ def test_a_moved_object_is_grasped_where_it_is(worlds, box):
 def test_twenty_cycles_unattended(world):
     for _ in range(20):
         assert world.grasp().success
-    homes = [e.arms for e in world.done(GoHome)]
-    assert homes == 20 * [("left",), ("right",), ("right",)]
+    assert [e.arms for e in world.done(GoHome)] == 20 * [("left",), ("right",), ("right",)]
 
 
 def test_a_place_that_is_asked_for_is_used(world):
-    outcome = world.succeeds(place=(0.3, -0.35, 0.0))
-    assert outcome.place_position == pytest.approx((0.3, -0.35, 0.4))
+    assert world.succeeds(place=(0.3, -0.35, 0.0)).place_position == pytest.approx((0.3, -0.35, 0.4))
 
 
 @pytest.mark.requirement("R-18", "A-70")
@@ -153,8 +151,7 @@ def test_dry_run_plans_both_and_moves_nothing(world):
 # --- seeing
 @pytest.mark.requirement("B-58")
 def test_an_unknown_object_is_refused_with_what_is_in_view(world):
-    outcome = world.ends(Code.UNKNOWN_OBJECT, label="mug")
-    assert outcome.message == "no 'mug' in view; in view: blue, red"
+    assert world.ends(Code.UNKNOWN_OBJECT, label="mug").message == "no 'mug' in view; in view: blue, red"
     assert world.states.count(State.DETECT) == 3
     assert State.TRANSFORM not in world.states
 
@@ -222,8 +219,7 @@ def test_out_of_reach_names_the_reason_and_the_nearest_arm(world):
 def test_in_the_overlap_the_second_arm_is_tried(worlds, box):
     world = worlds(box("red", 0.26, -0.05))
     world.fail(lambda e: isinstance(e, PlanGrasp) and e.arm == "right", Code.NO_PLAN)
-    outcome = world.succeeds()
-    assert outcome.arm == "left"
+    assert world.succeeds().arm == "left"
 
 
 def test_a_place_out_of_reach_is_refused_before_anything_moves(world):

@@ -30,8 +30,7 @@ def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(two: World
     pusher = next(e.arm for e in two.done(Follow))
     assert f"push 1 by the {pusher} hand moved it 60 mm" in outcome.message
     assert pusher != outcome.arm  # the hand that comes from the other side pushes
-    closed = next(e for e in two.done(Grip))
-    assert closed.position == 0.0
+    assert next(e for e in two.done(Grip)).position == 0.0
 
 
 @pytest.mark.requirement("N-13")
@@ -76,8 +75,7 @@ def test_the_camera_verifies_a_push(two: World) -> None:
 
 @pytest.mark.requirement("N-13")
 def test_after_a_push_the_object_is_looked_for_where_it_was_pushed_to_not_where_the_request_said(robot) -> None:
-    two = robot(0.46, 0.02, far=0.40)
-    outcome = two.ask(object_at=(0.46, 0.02))
+    outcome = robot(0.46, 0.02, far=0.40).ask(object_at=(0.46, 0.02))
     assert (outcome.code, outcome.route) == (Code.OK, "push"), outcome.message
 
 
@@ -148,8 +146,7 @@ def test_what_does_not_move_aside_is_pushed_in_other_directions_and_reported(rob
 
 @pytest.mark.parametrize("arm", ["left", "right"])
 def test_an_arm_that_is_asked_for_pushes_aside(robot, arm) -> None:
-    two = robot(0.30, 0.02)
-    assert two.ask("red", phase="aside", arm=arm).arm == arm
+    assert robot(0.30, 0.02).ask("red", phase="aside", arm=arm).arm == arm
 
 
 def test_a_dry_run_of_a_push_aside_moves_nothing(robot) -> None:

@@ -27,8 +27,7 @@ def test_a_miss_opens_backs_off_and_tries_another_way(world):
     world.slips = 1
     assert world.succeeds().attempts == 2
     missed = world.log[world.log.index(next(x for x in world.log if world.grips(opening=False)(x[1]))) :]
-    kinds = [type(e) for _, e in missed[3:8]]  # pause, measure
-    assert kinds == [Grip, Wait, MoveLinear, GoHome, GoHome]
+    assert [type(e) for _, e in missed[3:8]] == [Grip, Wait, MoveLinear, GoHome, GoHome]  # pause, measure
     first, second = world.done(PlanGrasp)
     assert first.candidates[0].id not in {way.id for way in second.candidates}
 
@@ -77,8 +76,7 @@ def test_where_an_object_is_that_was_moved_in_vain_is_said(world, box):
             world.objects.update(red=box("red", 0.34, -0.2))
 
     world.faults.append(roll)
-    outcome = world.ends(Code.GRASP_MISSED)
-    assert outcome.object_position[0] == pytest.approx(0.34)
+    assert world.ends(Code.GRASP_MISSED).object_position[0] == pytest.approx(0.34)
 
 
 def test_a_hand_that_stops_short_has_met_the_object(world):
@@ -113,8 +111,7 @@ def test_a_placed_object_that_the_detector_misses_is_looked_for_again(world):
         return real(count)
 
     world.frames = frames
-    outcome = world.succeeds()
-    assert (outcome.attempts, missed) == (1, [3])
+    assert (world.succeeds().attempts, missed) == (1, [3])
 
 
 def test_an_alarm_that_the_look_from_home_does_not_confirm_is_raised_once(world, box):
@@ -145,8 +142,7 @@ def test_held_but_still_seen_in_its_place_is_put_back(world):
     """The hand has something, but the camera says it is not the object: no success, and nothing is dropped."""
     world.lifted = lambda label: None
     world.ends(Code.GRASP_MISSED, "still stands at its place")
-    linear = [e.what for e in world.done(MoveLinear)]
-    assert linear == ["put back", "back off"] * 3
+    assert [e.what for e in world.done(MoveLinear)] == ["put back", "back off"] * 3
 
 
 def test_lost_on_the_way_is_found_again(world, box):
@@ -350,8 +346,7 @@ def test_what_a_hand_holds_and_meets_something_on_its_way_back_is_let_go_there(w
     world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN, times=1)
     world.lifted = lambda label: None  # it is still seen in its place
     world.fail(lambda e: isinstance(e, MoveLinear) and e.what == "put back", Code.EXECUTION_FAILED)
-    outcome = world.ends(Code.GRASP_MISSED)
-    assert not outcome.held
+    assert not world.ends(Code.GRASP_MISSED).held
     assert world.held is None
 
 

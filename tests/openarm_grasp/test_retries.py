@@ -114,8 +114,7 @@ def test_a_grasp_is_repeated_only_when_there_is_no_other_and_that_is_said():
     """One side fits into the hand, which may not lean, and the object is too flat for a higher grasp."""
     flat = with_size(standing("red", 0.26, -0.2, size=0.03), 0.04, 0.09, 0.03)
     world = World(flat, approach={"tilts_deg": [0.0]})
-    tried = attempts(world, [flat], [0], [Code.GRASP_MISSED])
-    assert len(tried) == 3
+    assert len(attempts(world, [flat], [0], [Code.GRASP_MISSED])) == 3
     said = [status.reason for status in world.status if status.state is State.PLAN]
     assert ["all that is left has failed before" in reason for reason in said] == [False, True, True]
 
@@ -137,8 +136,7 @@ def test_what_is_refused_elsewhere_is_asked_for_again_last():
         return await real(request)
 
     world.plan, world.slips = plan, 1
-    outcome = world.succeeds()
-    assert outcome.attempts == 2
+    assert world.succeeds().attempts == 2
     assert asked[0] == 28
     assert asked[1] == asked[2] > asked[3] > 0
     assert any("all that is left has failed before" in reason for reason in world.notes)

@@ -58,8 +58,7 @@ def test_the_answer_breaks_down_the_time_and_what_is_late_is_said(worlds, box):
     assert [name for name, one in times.items() if one.exceeded] == ["LIFT"]
     assert warned == [f"LIFT took {times['LIFT'].longest:.1f} s, expected at most 3 s"]
     assert [status.late for status in world.status if status.late] == warned
-    lift = next(status for status in world.status if status.state is S.LIFT)
-    assert lift.budget == 3.0
+    assert next(status for status in world.status if status.state is S.LIFT).budget == 3.0
 
 
 def test_the_end_of_a_request_says_its_code(world):

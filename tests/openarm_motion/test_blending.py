@@ -84,8 +84,7 @@ def test_a_corner_that_is_rounded_less_is_nearer_to_the_path_and_at_last_on_it(w
     stops = time_polyline(NAMES, waypoints, LIMITS)
     assert durations[-1] == stops.duration
     assert durations[0] <= durations[-1] + 1e-6
-    last = timing.trajectory()
-    np.testing.assert_array_equal(last.q, stops.q)
+    np.testing.assert_array_equal(timing.trajectory().q, stops.q)
 
 
 def test_the_corner_next_to_a_fault_is_rounded_less_and_no_other_one() -> None:

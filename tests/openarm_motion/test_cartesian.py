@@ -12,14 +12,21 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.solids import box_from
-from openarm_motion.kinematics.chain import ArmKinematics
+from openarm_motion.kinematics.chain import ArmKinematics, Solution
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.kinematics.line import line_contact, line_poses, solve_line
 from openarm_motion.planning.arm import Arm
+from tests.refusals import refused
 
 
 def down(x: float, y: float, z: float) -> np.ndarray:
     return se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (x, y, z))
+
+
+def at_home(arm: Arm, home: dict[str, float]) -> tuple[Solution, np.ndarray]:
+    """Where a line begins: the solution and its pose."""
+    start = arm.inverse.classify([home[name] for name in arm.names])
+    return start, arm.kinematics.fk(start.q)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -48,21 +55,16 @@ def test_a_line_is_straight_to_a_tenth_of_a_millimetre_and_keeps_its_branch(arms
 
 
 def test_a_turn_on_the_spot_is_a_line_too(right: Arm, home: dict[str, float]) -> None:
-    start = right.inverse.classify([home[name] for name in right.names])
-    T = right.kinematics.fk(start.q)
-    goal = T @ se3.make(se3.rot_z(0.3))
-    line = solve_line(right.inverse, start, T, goal, 0.0)
+    start, T = at_home(right, home)
+    line = solve_line(right.inverse, start, T, T @ se3.make(se3.rot_z(0.3)), 0.0)
     poses = right.kinematics.fk_many(line.q)
     np.testing.assert_allclose(poses[:, :3, 3], np.tile(T[:3, 3], (len(poses), 1)), atol=1e-9)
     assert line.s[-1] == pytest.approx(0.2 * 0.3)
 
 
 def test_reversed_line_goes_back(right: Arm, home: dict[str, float]) -> None:
-    start = right.inverse.classify([home[name] for name in right.names])
-    T = right.kinematics.fk(start.q)
-    goal = T.copy()
-    goal[2, 3] -= 0.1
-    line = solve_line(right.inverse, start, T, goal, 0.0)
+    start, T = at_home(right, home)
+    line = solve_line(right.inverse, start, T, se3.make(p=(0.0, 0.0, -0.1)) @ T, 0.0)
     back = line.reversed()
     np.testing.assert_array_equal(back.q[0], line.q[-1])
     np.testing.assert_allclose(back.q[-1], start.q, atol=1e-9)
@@ -71,23 +73,15 @@ def test_reversed_line_goes_back(right: Arm, home: dict[str, float]) -> None:
 
 
 def test_a_line_out_of_reach_says_where_it_ends_and_why(right: Arm, home: dict[str, float]) -> None:
-    start = right.inverse.classify([home[name] for name in right.names])
-    T = right.kinematics.fk(start.q)
-    goal = T.copy()
-    goal[0, 3] += 0.5
-    with pytest.raises(
-        OpenArmError, match=r"line of 500 mm ends after \d+ mm: .*(m from the shoulder|would be at)"
-    ) as e:
-        solve_line(right.inverse, start, T, goal, 0.05)
-    assert e.value.code == Code.UNREACHABLE
+    start, T = at_home(right, home)
+    goal = se3.make(p=(0.5, 0.0, 0.0)) @ T
+    said = r"line of 500 mm ends after \d+ mm: .*(m from the shoulder|would be at)"
+    assert refused(said, solve_line, right.inverse, start, T, goal, 0.05).code is Code.UNREACHABLE
 
 
 def test_a_collision_on_a_line_is_found_in_its_middle(right: Arm, home: dict[str, float]) -> None:
-    start = right.inverse.classify([home[name] for name in right.names])
-    T = right.kinematics.fk(start.q)
-    goal = T.copy()
-    goal[2, 3] -= 0.15
-    line = solve_line(right.inverse, start, T, goal, 0.0)
+    start, T = at_home(right, home)
+    line = solve_line(right.inverse, start, T, se3.make(p=(0.0, 0.0, -0.15)) @ T, 0.0)
     assert line_contact(right.scene(home), line) is None
     middle = T[:3, 3] + [0.0, 0.0, -0.075]
     post = box_from("post", middle, (0.02, 0.02, 0.02))
@@ -113,8 +107,7 @@ def test_a_line_of_an_arm_of_another_build(six: RobotDescription) -> None:
     inverse = InverseKinematics(ArmKinematics(six, "tool"))
     start = inverse.classify(np.array([0.2, 0.5, 1.2, 0.1, 0.6, 0.3]))
     T = inverse.kinematics.fk(start.q)
-    goal = T.copy()
-    goal[:3, 3] += (0.0, 0.05, -0.1)
+    goal = se3.make(p=(0.0, 0.05, -0.1)) @ T
     line = solve_line(inverse, start, T, goal, 0.0)
     between = inverse.kinematics.fk_many(0.5 * (line.q[1:] + line.q[:-1]))[:, :3, 3]
     direct = line_poses(T, goal)[0][:, :3, 3]

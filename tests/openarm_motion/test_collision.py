@@ -55,8 +55,7 @@ def test_known_postures_are_free(
     for posture in ("official_home", "hands_up"):
         state = description.group_state(f"{side}_arm", posture)
         assert scene.contacts(q_of(arm, state)) == [], posture
-    zero = dict.fromkeys(home, 0.0)
-    assert arm.scene(zero).contacts(np.zeros(7)) == []
+    assert arm.scene(dict.fromkeys(home, 0.0)).contacts(np.zeros(7)) == []
 
 
 def test_the_wrist_camera_is_part_of_the_arm(arms: dict[str, Arm], home: dict[str, float]) -> None:
@@ -251,8 +250,7 @@ def test_another_robot_without_srdf_is_checked(six: RobotDescription) -> None:
     robot = CollisionRobot(six, ArmKinematics(six, "tool"))
     scene = CollisionScene(robot, CollisionContext({}))
     assert scene.contacts(np.zeros(6)) == []
-    folded = np.array([0, 1.8, 2.3, 0, 0, 0.0])
-    assert scene.contacts(folded)
+    assert scene.contacts(np.array([0, 1.8, 2.3, 0, 0, 0.0]))
     wall = CollisionScene(robot, CollisionContext({}, [box_from("wall", (0, 0, 1.15), (0.3, 0.3, 0.1))]))
     assert wall.contacts(np.zeros(6))[0].second == "wall"
 

@@ -73,8 +73,7 @@ def test_to_a_pose_in_the_nearest_configuration(right: Arm, home: dict[str, floa
 
 @pytest.mark.requirement("B-47")
 def test_a_line_may_pass_by_an_object_nearer_than_a_free_path(right: Arm, home: dict[str, float]) -> None:
-    state = right.with_gripper(home, 0.044)
-    now = right.start_state(state)
+    now = right.start_state(right.with_gripper(home, 0.044))
     T = right.kinematics.fk(now.start)
     # a post between the open fingers, 6 mm from the left one
     post = Box("post", T @ se3.make(None, (0.0, 0.033, 0.02)), np.array([0.01, 0.01, 0.06]))

@@ -69,6 +69,10 @@ class Bench:
                     break
             self.tracks[name].append(self.q[name])
 
+    def ticks(self, n, commands):
+        for _ in range(n):
+            self.tick(commands)
+
     def overlaps(self):
         """Sentences about states in which something overlaps."""
         found = []
@@ -85,6 +89,11 @@ class Bench:
         return self.arms[name].kinematics.fk(self.q[name])[:3, 3]
 
 
+def turning(speed):
+    """Joint 5 alone, at a speed."""
+    return speed * np.eye(7)[4]
+
+
 def towards(direction, speed=0.4):
     return np.concatenate([speed * np.asarray(direction, dtype=float) / np.abs(direction).max(), np.zeros(3)])
 
@@ -97,8 +106,7 @@ def bench(arms, home) -> Bench:
 def test_a_twist_moves_the_tool_as_it_says(bench):
     before = bench.tool("right")
 
-    for _ in range(40):
-        bench.tick({"right": towards(np.array([0.0, 0.0, -1.0]), 0.1)})
+    bench.ticks(40, {"right": towards([0.0, 0.0, -1.0], 0.1)})
 
     moved = bench.tool("right") - before
     assert moved[2] < -0.015
@@ -136,8 +144,7 @@ def test_at_full_speed_towards_the_table_an_arm_slows_and_what_it_holds_stops_ov
     bench = Bench(arms, home, held={"left": (), "right": (box_from("cube", (0.0, 0.0, 0.05), (0.05, 0.05, 0.15)),)})
     top = table.T[2, 3] + 0.5 * table.size[2]
 
-    for _ in range(300):
-        bench.tick({"right": towards(np.array([0.0, 0.0, -1.0]))})
+    bench.ticks(300, {"right": towards([0.0, 0.0, -1.0])})
 
     assert bench.overlaps() == []
     assert bench.said["right"] & {Status.HALT_FOR_COLLISION, Status.JOINT_BOUND, Status.HALT_FOR_SINGULARITY}
@@ -145,7 +152,6 @@ def test_at_full_speed_towards_the_table_an_arm_slows_and_what_it_holds_stops_ov
 
 
 def test_arms_sent_towards_each_other_stop_apart(bench):
-
     for _ in range(150):
         way = bench.tool("left") - bench.tool("right")
         bench.tick({"right": towards(way), "left": towards(-way)})
@@ -155,11 +161,7 @@ def test_arms_sent_towards_each_other_stop_apart(bench):
 
 
 def test_a_joint_stops_before_its_limit(bench, arms):
-    velocity = np.zeros(7)
-    velocity[4] = 0.5
-
-    for _ in range(450):
-        bench.tick({"left": velocity})
+    bench.ticks(450, {"left": turning(0.5)})
 
     arm = arms["left"]
     assert bench.q["left"][4] <= arm.upper[4] - CONFIG.joint_limit_margin + 1e-6
@@ -169,18 +171,14 @@ def test_a_joint_stops_before_its_limit(bench, arms):
 
 def test_set_points_keep_velocity_acceleration_and_jerk(arms, home):
     bench, rng = Bench(arms, home), np.random.default_rng(5)
-    arm = arms["right"]
-    limits = arm.limits(1.0)
+    limits = arms["right"].limits(1.0)
 
     for k in range(200):
         if k % 40 == 0:
             twist = rng.uniform(-0.4, 0.4, 6)
         bench.tick({"right": twist})
 
-    states = []
-    for servo_start, servo_velocity in zip(bench.tracks["right"][:-1], bench.tracks["right"][1:], strict=True):
-        states.append((servo_velocity - servo_start) / 0.01)
-    speed = np.abs(states)
+    speed = np.abs(np.diff(bench.tracks["right"], axis=0)) / 0.01
     assert np.all(speed <= limits.velocity * 1.01)
     course = Course.of(JointState.rest(bench.q["right"]), 0.9 * limits.velocity, 0.5, limits)
     a = np.array([course.at(t).a for t in np.arange(0.0, course.duration, 1e-3)])
@@ -189,14 +187,10 @@ def test_set_points_keep_velocity_acceleration_and_jerk(arms, home):
 
 
 def test_when_commands_cease_the_set_point_begins_to_slow_within_50_ms_and_every_trajectory_ends_at_rest(bench):
-    velocity = np.zeros(7)
-    velocity[4] = 0.3
-    for _ in range(60):
-        bench.tick({"right": velocity})
+    bench.ticks(60, {"right": turning(0.3)})
     last = len(bench.tracks["right"])
 
-    for _ in range(60):
-        bench.tick({})
+    bench.ticks(60, {})
 
     speed = np.abs(np.diff(np.array(bench.tracks["right"])[:, 4])) / 0.01
     slowed = np.flatnonzero(speed[last:] < 0.999 * speed[last - 2])[0]
@@ -207,31 +201,24 @@ def test_when_commands_cease_the_set_point_begins_to_slow_within_50_ms_and_every
 
 
 def test_a_stretched_arm_stops_at_the_singular_posture_and_comes_back(bench):
-    for _ in range(250):
-        bench.tick({"right": towards(np.array([1.0, -0.2, 0.3]))})
+    bench.ticks(250, {"right": towards([1.0, -0.2, 0.3])})
     assert bench.said["right"] & {Status.HALT_FOR_SINGULARITY, Status.JOINT_BOUND}
     out = bench.tool("right")
 
-    for _ in range(150):
-        bench.tick({"right": towards(np.array([-1.0, 0.2, -0.3]))})
+    bench.ticks(150, {"right": towards([-1.0, 0.2, -0.3])})
 
     assert np.linalg.norm(bench.tool("right") - out) > 0.03
 
 
 def test_an_arm_that_does_not_follow_gets_no_set_points_until_commands_pause(bench, arms):
-    velocity = np.zeros(7)
-    velocity[4] = 0.5
     bench.stuck.add("right")
-    for _ in range(60):
-        bench.tick({"right": velocity})
+    bench.ticks(60, {"right": turning(0.5)})
     assert bench.servos["right"].report.status is Status.INVALID
     assert arms["right"].names[4] in bench.servos["right"].report.text
     bench.stuck.clear()
-    for _ in range(60):
-        bench.tick({})
+    bench.ticks(60, {})
 
-    for _ in range(60):
-        bench.tick({"right": velocity})
+    bench.ticks(60, {"right": turning(0.5)})
 
     assert bench.servos["right"].report.status is Status.NO_WARNING
 

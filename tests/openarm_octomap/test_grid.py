@@ -170,8 +170,7 @@ def test_views_into_the_distance_clear_and_a_switch_keeps_them_from_it() -> None
     grid = OccupancyGrid(GridConfig(**SMALL))
     dropouts = floor()
     dropouts[::2, ::2] = 0
-    update = grid.integrate([scan(dropouts)], 0)
-    assert update.cleared == 0
+    assert grid.integrate([scan(dropouts)], 0).cleared == 0
 
 
 def test_robot_pixels_clear_up_to_the_robot_and_mark_nothing(grid: OccupancyGrid) -> None:

@@ -23,7 +23,7 @@ from openarm_sim_bridge.drafting.draft import draft_folder
 from openarm_sim_bridge.drafting.edits import Edits
 from openarm_sim_bridge.drafting.mesh_files import _budgets, write_stl
 from openarm_sim_bridge.drafting.mjcf import UrdfDraft, compiled
-from tests.refusals import refused
+from tests.refusals import refused, refuses
 
 #: Two arms that mirror each other, of a hinge off the origin of its body, a slide, and two fingers that are coupled.
 ARM = """
@@ -190,7 +190,8 @@ def test_what_a_urdf_cannot_have_is_named(mjcf, find, replace, words):
     text = mjcf.read_text()
     assert find in text
     mjcf.write_text(text.replace(find, replace, 1))
-    assert refused(words, UrdfDraft, "two", compiled(mjcf), Edits.model_validate(EDITS)).code is Code.CONFIG_INVALID
+    with refuses(Code.CONFIG_INVALID, words):
+        UrdfDraft("two", compiled(mjcf), Edits.model_validate(EDITS))
 
 
 def test_a_draft_says_what_is_left_to_do(folder):
