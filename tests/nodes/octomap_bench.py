@@ -52,14 +52,8 @@ class Bench:
         self.joints = node.create_publisher(JointState, "/joint_states", QOS_COMMAND)
         self.held = node.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
         self.static = node.create_publisher(TFMessage, "/tf_static", QOS_STATIC_TF)
-        self.static.publish(
-            TFMessage(
-                transforms=[
-                    matrix_to_transform(CAMERA.parent, CAMERA.link_frame, CAMERA.T_parent_link, 0),
-                    matrix_to_transform(CAMERA.link_frame, FRAME, T_LINK_OPTICAL, 0),
-                ]
-            )
-        )
+        edges = ((CAMERA.parent, CAMERA.link_frame, CAMERA.T_parent_link), (CAMERA.link_frame, FRAME, T_LINK_OPTICAL))
+        self.static.publish(TFMessage(transforms=[matrix_to_transform(*edge, 0) for edge in edges]))
         self.field = field_path(f"test_{tmp_path.name}")
         all_params = {
             "cameras": ["overhead"], "period": 0.05, "field.name": f"test_{tmp_path.name}", "cloud_topic": "", **params

@@ -138,9 +138,8 @@ def test_spawn_adds_an_object_on_the_table_and_names_what_is_wrong(bench) -> Non
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
     size, pose = Vector3(x=0.04, y=0.04, z=0.04), PoseStamped()
     pose.pose.position.x, pose.pose.position.y = 0.4, 0.0
-    assert bench.call(
-        SpawnObject, "/sim/spawn_object", name="extra", shape="box", size=size, color="purple", pose=pose
-    ).success
+    box = {"shape": "box", "size": size, "pose": pose}
+    bench.done(SpawnObject, "/sim/spawn_object", name="extra", color="purple", **box)
     bench.ros.spin_until(lambda: any(o.name == "extra" for m in got for o in m.objects), what="the object")
     extra = next(o for o in got[-1].objects if o.name == "extra")
     assert extra.pose.position.z == pytest.approx(0.42, abs=0.002)
@@ -150,11 +149,7 @@ def test_spawn_adds_an_object_on_the_table_and_names_what_is_wrong(bench) -> Non
         ({"name": "other", "shape": "cone"}, "'box', 'cylinder'"),
         ({"name": "other", "color": "pink"}, "red"),
     ):
-        answer = bench.call(
-            SpawnObject,
-            "/sim/spawn_object",
-            **({"shape": "box", "size": size, "color": "orange", "pose": pose} | change),
-        )
+        answer = bench.call(SpawnObject, "/sim/spawn_object", **(box | {"color": "orange"} | change))
         assert not answer.success, change
         assert text in answer.message
     assert bench.call(ResetWorld, "/sim/reset_world").success

@@ -13,6 +13,13 @@ from typing import Any
 
 import aiohttp
 import pytest
+import rclpy
+from geometry_msgs.msg import PointStamped
+from openarm_interfaces.srv import Grasp
+from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import String
+
+from openarm_common.ros.node import QOS_LATCHED
 
 pytest.importorskip(
     "foxglove", reason="needs foxglove-sdk: .venv/bin/uv pip install --require-hashes -r requirements-viz.lock"
@@ -93,11 +100,6 @@ async def message_of(socket: aiohttp.ClientWebSocketResponse, channel: dict[str,
 
 def test_a_topic_is_advertised_with_its_definition_and_its_messages_come_byte_for_byte(ros, foxglove: Foxglove) -> None:
     """Twice, for the second client of a latched topic gets the message too."""
-    from geometry_msgs.msg import PointStamped
-    from rclpy.serialization import serialize_message
-
-    from openarm_common.ros.node import QOS_LATCHED
-
     message = PointStamped()
     message.header.frame_id = "table_frame"  # of a length that needs no padding, whose bytes are anything
     message.point.x = 0.25
@@ -125,12 +127,6 @@ def test_a_topic_is_advertised_with_its_definition_and_its_messages_come_byte_fo
 
 def test_a_latched_message_comes_where_its_publisher_does_after_the_client(ros, foxglove: Foxglove) -> None:
     """Until then the topic is known by a subscription only, and what will be offered is not."""
-    import rclpy
-    from rclpy.serialization import serialize_message
-    from std_msgs.msg import String
-
-    from openarm_common.ros.node import QOS_LATCHED
-
     ros.hear(String, "/later")
     elsewhere = rclpy.Context()
     rclpy.init(context=elsewhere)
@@ -154,9 +150,6 @@ def test_a_latched_message_comes_where_its_publisher_does_after_the_client(ros, 
 
 
 def test_a_service_is_called_from_foxglove(ros, foxglove: Foxglove) -> None:
-    from openarm_interfaces.srv import Grasp
-    from rclpy.serialization import deserialize_message, serialize_message
-
     def grasp(request: Grasp.Request, response: Grasp.Response) -> Grasp.Response:
         response.message = f"asked for {request.label}"
         return response
@@ -180,11 +173,6 @@ def test_a_service_is_called_from_foxglove(ros, foxglove: Foxglove) -> None:
 
 
 def test_the_meshes_of_the_description_are_served_and_no_other_file(ros, foxglove: Foxglove, tmp_path: Path) -> None:
-    from rclpy.serialization import deserialize_message
-    from std_msgs.msg import String
-
-    from openarm_common.ros.node import QOS_LATCHED
-
     mesh, secret = tmp_path / "link 1.stl", tmp_path / "secret"
     mesh.write_bytes(bytes(range(256)) * 9000)
     secret.write_text("not for viewers")

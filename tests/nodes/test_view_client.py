@@ -11,17 +11,29 @@ from typing import Any
 
 import numpy as np
 import pytest
+from action_msgs.srv import CancelGoal
+from geometry_msgs.msg import Point, TransformStamped
+from openarm_interfaces.msg import GraspStatus
+from openarm_interfaces.srv import ConfirmPlan, ResetWorld
+from rclpy.task import Future
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
 
+from openarm_bringup.view.ros.page import GraphView
+from openarm_bringup.view.server import Confirmation, Order, Reset
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
+from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF
 
 
 class Looking:
     """A view of the graph of a test, and the newest that it has seen of each key."""
 
     def __init__(self, ros, timeout: float = 0.3) -> None:
-        from openarm_bringup.view.ros.page import GraphView
-
         self.ros = ros
         self.seen: dict[str, Any] = {}
         self.ended: list[BaseException] = []
@@ -54,9 +66,6 @@ def patient(ros):
 
 def serve(ros) -> None:
     """Offer what the page asks for."""
-    from action_msgs.srv import CancelGoal
-    from openarm_interfaces.srv import ResetWorld
-    from std_srvs.srv import Trigger
 
     def answered(_: Any, response: Any) -> Any:
         response.success, response.message = True, "heard"
@@ -90,14 +99,6 @@ def ask(ros, question: Callable[[], Any]) -> Any:
 
 
 def test_a_cloud_is_made_of_depth_and_colour_of_one_stamp(ros, looking: Looking) -> None:
-    from geometry_msgs.msg import TransformStamped
-    from sensor_msgs.msg import CameraInfo, Image
-    from tf2_msgs.msg import TFMessage
-
-    from openarm_common.camera.cameras import Intrinsics
-    from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform
-    from openarm_common.ros.node import QOS_SENSOR, QOS_STATIC_TF
-
     frame = "overhead_color_optical_frame"
     intrinsics = Intrinsics.from_fovy(64, 48, 60.0)
     outs = {
@@ -142,12 +143,6 @@ def test_a_cloud_is_made_of_depth_and_colour_of_one_stamp(ros, looking: Looking)
 
 
 def test_what_hangs_on_a_link_and_the_way_of_a_plan_are_shown(ros, looking: Looking) -> None:
-    from geometry_msgs.msg import Point
-    from sensor_msgs.msg import JointState
-    from visualization_msgs.msg import Marker, MarkerArray
-
-    from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED
-
     held = Marker(type=Marker.CUBE, action=Marker.ADD, ns="red")
     held.header.frame_id = "openarm_left_hand_tcp"
     held.scale.x = held.scale.y = held.scale.z = 0.05
@@ -169,14 +164,6 @@ def test_what_hangs_on_a_link_and_the_way_of_a_plan_are_shown(ros, looking: Look
 
 @pytest.mark.requirement("P-20", "R-25")
 def test_the_plan_that_waits_is_shown_in_place_of_newer_ones_and_answered(ros, looking: Looking) -> None:
-    from geometry_msgs.msg import Point
-    from openarm_interfaces.msg import GraspStatus
-    from openarm_interfaces.srv import ConfirmPlan
-    from visualization_msgs.msg import Marker, MarkerArray
-
-    from openarm_bringup.view.server import Confirmation
-    from openarm_common.ros.node import QOS_LATCHED
-
     def way(ns: str, x: float) -> MarkerArray:
         line = Marker(ns=ns, type=Marker.LINE_STRIP, points=[Point(x=x), Point(x=x + 0.1)])
         return MarkerArray(markers=[Marker(action=Marker.DELETEALL), line])
@@ -217,10 +204,6 @@ def test_the_plan_that_waits_is_shown_in_place_of_newer_ones_and_answered(ros, l
 
 
 def test_a_message_that_can_t_be_shown_is_said_and_the_rest_goes_on(ros, looking: Looking) -> None:
-    from sensor_msgs.msg import Image
-
-    from openarm_common.ros.node import QOS_SENSOR
-
     images = ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_SENSOR)
     bad = Image(encoding="bayer", width=2, height=2, step=2, data=[0] * 4)
     ros.node.create_timer(0.05, lambda: images.publish(bad))
@@ -231,8 +214,6 @@ def test_a_message_that_can_t_be_shown_is_said_and_the_rest_goes_on(ros, looking
 
 @pytest.mark.long
 def test_without_a_graph_every_question_has_an_answer(looking: Looking) -> None:
-    from openarm_bringup.view.server import Order, Reset
-
     view = looking.view
     for ask in (lambda: view.pick(Order(label="red")), view.cancel, lambda: view.reset(Reset())):
         with pytest.raises(OpenArmError, match="is the graph up") as refused:
@@ -242,8 +223,6 @@ def test_without_a_graph_every_question_has_an_answer(looking: Looking) -> None:
 
 def test_no_request_ends_the_client(ros, looking: Looking) -> None:
     """A value that no message can hold is refused; the same client then still resets, stops and cancels."""
-    from openarm_bringup.view.server import Order, Reset
-
     serve(ros)
     view = looking.view
     refused = ask(ros, lambda: view.reset(Reset.model_construct(scene="", seed=2**63)))
@@ -260,8 +239,6 @@ def test_no_request_ends_the_client(ros, looking: Looking) -> None:
 
 
 def test_what_fails_in_the_thread_of_the_client_is_said_and_does_not_end_it(ros, patient: Looking, capfd) -> None:
-    from openarm_bringup.view.server import Reset
-
     def fail() -> None:
         raise RuntimeError("a fault of the test")
 
@@ -282,8 +259,6 @@ def test_what_fails_in_the_thread_of_the_client_is_said_and_does_not_end_it(ros,
 
 
 def test_stop_and_cancel_are_answered_while_another_request_is_stuck(ros, patient: Looking) -> None:
-    from openarm_bringup.view.server import Reset
-
     serve(ros)
     view, stuck, go_on = patient.view, threading.Event(), threading.Event()
     cancelled = (False, "no grasp runs that was asked for by /grasp/pick")
@@ -326,9 +301,6 @@ def test_a_layer_that_can_t_be_made_ends_the_view_with_its_error(ros, looking: L
     ],
 )
 def test_a_request_whose_client_ends_says_why(ros, end: Callable[[BackgroundNode], object], why: str) -> None:
-    from rclpy.task import Future
-    from std_srvs.srv import Trigger
-
     asked: list[Trigger.Request] = []
     never = Future()
 

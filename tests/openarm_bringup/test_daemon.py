@@ -103,8 +103,12 @@ def test_which_commands_a_daemon_runs(line: str, answered: bool) -> None:
     assert is_answered(line.split()) is answered
 
 
-def test_an_answer_is_printed_and_its_code_returned(answers: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    daemon = answers(*ANSWER)
+@pytest.fixture
+def daemon(answers: Callable[..., Answers]) -> Answers:
+    return answers(*ANSWER)
+
+
+def test_an_answer_is_printed_and_its_code_returned(daemon: Answers, capsys: pytest.CaptureFixture[str]) -> None:
     assert client.ask(["topic", "list"]) == 3
     assert client.ask(["topic", "list", "--domain", "5"]) == 3
     assert capsys.readouterr() == ("/clock\n" * 2, "a hint\n" * 2)
@@ -112,8 +116,7 @@ def test_an_answer_is_printed_and_its_code_returned(answers: Any, capsys: pytest
 
 
 @pytest.mark.parametrize("words", [("--domain", "6"), ("--domain=6",), ("--domain",), ("--domain", "x")])
-def test_another_domain_is_not_asked(answers: Any, words: tuple[str, ...]) -> None:
-    daemon = answers(*ANSWER)
+def test_another_domain_is_not_asked(daemon: Answers, words: tuple[str, ...]) -> None:
     assert client.ask(["topic", "list", *words]) is None
     assert daemon.asked == []
 
@@ -143,16 +146,14 @@ def test_another_build_is_not_asked(answers: Any) -> None:
 
 
 @pytest.mark.parametrize("what", ["folder", "socket"])
-def test_what_others_can_open_is_not_asked(answers: Any, what: str) -> None:
-    daemon = answers(*ANSWER)
+def test_what_others_can_open_is_not_asked(daemon: Answers, what: str) -> None:
     (state_dir() if what == "folder" else socket_path(os.getpid())).chmod(0o770)
     assert client.ask(["topic", "list"]) is None
     assert daemon.asked == []
 
 
 @pytest.mark.requirement("R-23")
-def test_what_is_another_users_is_not_asked(answers: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    daemon = answers(*ANSWER)
+def test_what_is_another_users_is_not_asked(daemon: Answers, monkeypatch: pytest.MonkeyPatch) -> None:
     assert is_private(socket_path(os.getpid()))
     other = os.geteuid() + 1
     with monkeypatch.context() as patch:
@@ -163,8 +164,7 @@ def test_what_is_another_users_is_not_asked(answers: Any, monkeypatch: pytest.Mo
     assert daemon.asked == []
 
 
-def test_a_link_in_the_place_of_the_folder_is_not_followed(answers: Any, tmp_path: Path) -> None:
-    daemon = answers(*ANSWER)
+def test_a_link_in_the_place_of_the_folder_is_not_followed(daemon: Answers, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     state_dir().rename(tmp_path / "elsewhere" / "openarm")
     state_dir().symlink_to(tmp_path / "elsewhere" / "openarm")
@@ -204,8 +204,7 @@ def test_a_daemon_that_ends_during_a_command_is_an_error(
     assert json.loads(capsys.readouterr().out.removeprefix("half"))["code"] == "INTERNAL"
 
 
-def test_a_request_that_is_too_long_is_not_sent(answers: Any) -> None:
-    daemon = answers(*ANSWER)
+def test_a_request_that_is_too_long_is_not_sent(daemon: Answers) -> None:
     assert client.ask(["topic", "pub", "/talk", "x" * LONGEST]) is None
     assert daemon.asked == []
 
