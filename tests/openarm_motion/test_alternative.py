@@ -12,8 +12,8 @@ from openarm_motion.collision.solids import box_from
 from openarm_motion.planning import moves
 from openarm_motion.planning.alternative import near_joints, near_pose
 from openarm_motion.planning.arm import Arm
-from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.moves import RequestBoxes
+from tests.refusals import refused
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
@@ -23,11 +23,10 @@ def test_a_pose_in_a_box_is_refused_with_the_pair_and_the_nearest_pose_above(
 ) -> None:
     now, pose = right.start_state(home, scale=1.0), se3.make(DOWN, (0.28, -0.24, 0.50))
     around = RequestBoxes([box_from("crate", (0.28, -0.24, 0.45), (0.12, 0.12, 0.10))])
-    with pytest.raises(PlanFailedError) as caught:
-        moves.to_pose(right, now, pose, around)
-    assert (caught.value.code, caught.value.stage) == (Code.IN_COLLISION, "goal")
-    assert caught.value.contact is not None
-    assert caught.value.contact.second == "crate"
+    error = refused(None, moves.to_pose, right, now, pose, around)
+    assert (error.code, error.stage) == (Code.IN_COLLISION, "goal")
+    assert error.contact is not None
+    assert error.contact.second == "crate"
     found = near_pose(right, now, around, pose, budget=60.0)
     assert found is not None
     np.testing.assert_allclose(found.pose[:3, :3], DOWN, atol=1e-3)
@@ -38,9 +37,8 @@ def test_a_pose_in_a_box_is_refused_with_the_pair_and_the_nearest_pose_above(
 
 def test_a_pose_out_of_reach_has_the_nearest_in_reach(right: Arm, home: dict[str, float]) -> None:
     now, pose = right.start_state(home, scale=1.0), se3.make(DOWN, (0.62, -0.24, 0.62))
-    with pytest.raises(PlanFailedError) as caught:
-        moves.to_pose(right, now, pose, RequestBoxes())
-    assert (caught.value.code, caught.value.stage) == (Code.UNREACHABLE, "goal")
+    error = refused(None, moves.to_pose, right, now, pose, RequestBoxes())
+    assert (error.code, error.stage) == (Code.UNREACHABLE, "goal")
     found = near_pose(right, now, RequestBoxes(), pose, budget=60.0)
     assert found is not None
     assert 0.0 < found.distance < 0.35
@@ -53,9 +51,8 @@ def test_joints_in_a_wall_end_before_it(right: Arm, home: dict[str, float]) -> N
         s.q for s in right.inverse.solutions(se3.make(DOWN, (0.30, -0.10, 0.62)), 0.05) if not scene.collides(s.q)
     )
     around = RequestBoxes([box_from("wall", (0.30, -0.10, 0.62), (0.1, 0.1, 0.1))])
-    with pytest.raises(PlanFailedError) as caught:
-        moves.to_joints(right, now, goal.tolist(), around)
-    assert caught.value.stage == "goal"
+    error = refused(None, moves.to_joints, right, now, goal.tolist(), around)
+    assert error.stage == "goal"
     found = near_joints(right, now, around, goal, budget=60.0)
     assert found is not None
     assert not right.scene(home, around.obstacles).collides(found.q)
@@ -66,12 +63,11 @@ def test_a_start_in_collision_names_the_pair(right: Arm, home: dict[str, float])
     now = right.start_state(home, scale=1.0)
     hand = right.kinematics.fk(now.start)[:3, 3]
     around = RequestBoxes([box_from("brick", hand, (0.2, 0.2, 0.2))])
-    with pytest.raises(PlanFailedError) as caught:
-        moves.to_joints(right, now, now.start.tolist(), around)
-    assert (caught.value.stage, caught.value.code) == ("start", Code.IN_COLLISION)
-    assert "starts in collision" in caught.value.message
-    assert caught.value.contact is not None
-    assert caught.value.contact.second == "brick"
+    error = refused(None, moves.to_joints, right, now, now.start.tolist(), around)
+    assert (error.stage, error.code) == ("start", Code.IN_COLLISION)
+    assert "starts in collision" in error.message
+    assert error.contact is not None
+    assert error.contact.second == "brick"
 
 
 def test_a_line_that_hits_something_names_it(right: Arm, home: dict[str, float]) -> None:
@@ -79,8 +75,7 @@ def test_a_line_that_hits_something_names_it(right: Arm, home: dict[str, float])
     below = right.kinematics.fk(now.start)
     below[2, 3] -= 0.08
     around = RequestBoxes([box_from("bar", below[:3, 3] - [0, 0, 0.02], (0.03, 0.03, 0.03))])
-    with pytest.raises(PlanFailedError) as caught:
-        moves.to_pose_on_line(right, now, below, around)
-    assert (caught.value.stage, caught.value.code) == ("line", Code.IN_COLLISION)
-    assert caught.value.contact is not None
-    assert caught.value.contact.second == "bar"
+    error = refused(None, moves.to_pose_on_line, right, now, below, around)
+    assert (error.stage, error.code) == ("line", Code.IN_COLLISION)
+    assert error.contact is not None
+    assert error.contact.second == "bar"

@@ -75,8 +75,13 @@ def test_a_goal_of_joints_of_another_arm_is_refused(arm, now) -> None:
         assert refused("openarm_left_joint1", ask).code is Code.INVALID_ARGUMENT
 
 
-def test_the_end_of_a_plan_lies_in_the_region_and_the_nearer_of_two_is_taken(arm, now) -> None:
-    T = arm.kinematics.fk(now.start)
+@pytest.fixture
+def T(arm, now) -> np.ndarray:
+    """Where the tool is."""
+    return arm.kinematics.fk(now.start)
+
+
+def test_the_end_of_a_plan_lies_in_the_region_and_the_nearer_of_two_is_taken(T: np.ndarray, arm, now) -> None:
     near, far = T.copy(), T.copy()
     near[:3, 3] += (0.0, 0.02, 0.02)
     far[:3, 3] += (0.02, 0.1, 0.1)
@@ -87,8 +92,7 @@ def test_the_end_of_a_plan_lies_in_the_region_and_the_nearer_of_two_is_taken(arm
     assert arm.kinematics.fk(trajectory.q[-1]) == pytest.approx(near, abs=1e-3)
 
 
-def test_a_position_alone_is_reached_in_whatever_orientation(arm, now) -> None:
-    T = arm.kinematics.fk(now.start)
+def test_a_position_alone_is_reached_in_whatever_orientation(T: np.ndarray, arm, now) -> None:
     p = T[:3, 3] + (0.0, 0.05, 0.05)
     region = Region(positions=(PositionRegion("tool", np.zeros(3), (Volume("sphere", se3.make(None, p), (1e-3,)),)),))
 
@@ -115,8 +119,7 @@ def test_poses_are_drawn_until_the_time_is_over_and_of_one_pose_there_is_nothing
     assert count(wide, -np.inf) == once
 
 
-def test_a_path_stays_in_its_region(arm, now) -> None:
-    T = arm.kinematics.fk(now.start)
+def test_a_path_stays_in_its_region(T: np.ndarray, arm, now) -> None:
     there = T.copy()
     there[:3, 3] += (0.02, 0.06, 0.06)
     path = Region(orientations=(OrientationRegion("tool", np.eye(3), T[:3, :3], (0.05, 0.05, 3.2)),))
@@ -127,8 +130,7 @@ def test_a_path_stays_in_its_region(arm, now) -> None:
     assert not path.violations(arm.names, states, arm.kinematics.fk_many(states)).any()
 
 
-def test_a_goal_outside_of_the_path_region_is_named(arm, now) -> None:
-    T = arm.kinematics.fk(now.start)
+def test_a_goal_outside_of_the_path_region_is_named(T: np.ndarray, arm, now) -> None:
     there = T @ se3.make(se3.rot_x(0.4))
     path = Region(orientations=(OrientationRegion("tool", np.eye(3), T[:3, :3], (0.05, 0.05, 0.05)),))
     with refuses(Code.VIOLATION, "the goal violates the path constraints"):
@@ -136,8 +138,7 @@ def test_a_goal_outside_of_the_path_region_is_named(arm, now) -> None:
 
 
 @pytest.mark.requirement("B-47")
-def test_a_cartesian_path_goes_through_its_way_points_and_ends_before_an_obstacle(arm, now) -> None:
-    T = arm.kinematics.fk(now.start)
+def test_a_cartesian_path_goes_through_its_way_points_and_ends_before_an_obstacle(T: np.ndarray, arm, now) -> None:
     first, second = T.copy(), T.copy()
     first[2, 3] += 0.04
     second[:3, 3] += (0.0, 0.04, 0.04)
@@ -157,23 +158,20 @@ def test_a_cartesian_path_goes_through_its_way_points_and_ends_before_an_obstacl
 
 
 @pytest.mark.parametrize("z", [1e30, float("nan")])
-def test_a_way_point_out_of_all_reach_is_refused(arm, now, z: float) -> None:
-    T = arm.kinematics.fk(now.start)
+def test_a_way_point_out_of_all_reach_is_refused(T: np.ndarray, arm, now, z: float) -> None:
     T[2, 3] = z
     with pytest.raises(OpenArmError, match=r"the way through 1 way points is .* long, expected less than 50"):
         along(arm, now, CartesianGoal((T,)), NOTHING)
 
 
 @pytest.mark.parametrize("scale", [(1e-9, 0.0), (0.0, 1e-9), (-1.0, 0.0), (float("nan"), 0.0)])
-def test_a_motion_that_would_take_days_is_refused(arm, now, scale: tuple[float, float]) -> None:
+def test_a_motion_that_would_take_days_is_refused(T: np.ndarray, arm, now, scale: tuple[float, float]) -> None:
     """Its trajectory would not fit into memory."""
-    T = arm.kinematics.fk(now.start)
     T[2, 3] += 0.04
     refused(r"_scale is .*, expected 0.001 to 1", along, arm, replace(now, scale=scale), CartesianGoal((T,)), NOTHING)
 
 
-def test_a_state_is_judged_by_contacts_and_constraints(arm, now) -> None:
-    T = arm.kinematics.fk(now.start)
+def test_a_state_is_judged_by_contacts_and_constraints(T: np.ndarray, arm, now) -> None:
     other = Region(orientations=(OrientationRegion("tool", np.eye(3), T[:3, :3] @ se3.rot_x(0.5), (0.1, 0.1, 0.1)),))
     box = box_from("box", T[:3, 3], (0.1, 0.1, 0.1))
 

@@ -31,6 +31,12 @@ def query(arm: Arm, scene: CollisionScene, start: np.ndarray, goals: np.ndarray,
     )
 
 
+def planar(start, goals, half: float, collides, edge_free, **limits: object) -> PlanQuery:
+    """A query in a square of two joints."""
+    ends = {"start": np.array(start), "goals": np.array(goals), "lower": np.full(2, -half), "upper": np.full(2, half)}
+    return PlanQuery(**ends, collides=collides, edge_free=edge_free, **limits)
+
+
 def assert_free(arm: Arm, state: dict[str, float], path: PlannedPath) -> None:
     """Nothing touches anywhere on the path, looked at more finely than the planner did; the table counts."""
     touch = Clearance(own=0.0, world=0.0, arms=0.0, hand=0.0, touch=0.0, rest=0.0)
@@ -113,15 +119,8 @@ def test_what_has_no_way_is_given_up_in_time() -> None:
     def edge_free(a: np.ndarray, b: np.ndarray) -> bool:
         return a[0] * b[0] > 0.0
 
-    nothing = PlanQuery(
-        start=np.array([-0.5, 0.0]),
-        goals=np.array([[0.5, 0.0], [0.5, 0.5]]),
-        lower=np.full(2, -1.0),
-        upper=np.full(2, 1.0),
-        collides=lambda q: bool(abs(q[0]) < 0.1),
-        edge_free=edge_free,
-        time_limit=0.3,
-    )
+    goals = [[0.5, 0.0], [0.5, 0.5]]
+    nothing = planar([-0.5, 0.0], goals, 1.0, lambda q: bool(abs(q[0]) < 0.1), edge_free, time_limit=0.3)
     assert refused(r"no free path to any of 2 goal.* within 0\.3 s", OmplPlanner().plan, nothing).code is Code.NO_PLAN
 
 
@@ -137,16 +136,8 @@ def test_samples_limit_a_search_in_place_of_time() -> None:
     def give_up(iterations: int) -> int:
         nonlocal seen
         seen = 0
-        nothing = PlanQuery(
-            start=np.array([-0.5, 0.0]),
-            goals=np.array([[0.5, 0.0]]),
-            lower=np.full(2, -1.0),
-            upper=np.full(2, 1.0),
-            collides=collides,
-            edge_free=lambda a, b: a[0] * b[0] > 0.0,
-            time_limit=1e-9,
-            iterations=iterations,
-        )
+        limits = {"time_limit": 1e-9, "iterations": iterations}
+        nothing = planar([-0.5, 0.0], [[0.5, 0.0]], 1.0, collides, lambda a, b: a[0] * b[0] > 0.0, **limits)
         refused(f"within {iterations} samples", OmplPlanner().plan, nothing)
         return seen
 
@@ -187,16 +178,7 @@ def test_what_the_search_finds_is_shortened() -> None:
         u = np.linspace(0, 1, 200)[:, None]
         return bool(np.all(np.linalg.norm(a + u * (b - a) - [0.5, 0.0], axis=1) > 0.9))
 
-    start, goal = np.array([-1.0, 0.0]), np.array([2.0, 0.0])
-    path = OmplPlanner().plan(
-        PlanQuery(
-            start=start,
-            goals=goal[None],
-            lower=np.full(2, -6.0),
-            upper=np.full(2, 6.0),
-            collides=lambda q: not around_a_disc(q, q),
-            edge_free=around_a_disc,
-        )
-    )
+    asked = planar([-1.0, 0.0], [[2.0, 0.0]], 6.0, lambda q: not around_a_disc(q, q), around_a_disc)
+    path = OmplPlanner().plan(asked)
     assert all(around_a_disc(a, b) for a, b in itertools.pairwise(path.waypoints))
     assert float(np.linalg.norm(np.diff(path.waypoints, axis=0), axis=1).sum()) < 1.3 * 3.6
