@@ -20,8 +20,6 @@ from openarm_common.robot.folder import robot_folder
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_SENSOR, QOS_TF, reliable
 
-pytestmark = pytest.mark.long
-
 #: Hz of wall time from real time on, below of simulated time.
 RATES = {
     "/joint_states": (JointState, QOS_COMMAND, 100.0),
@@ -32,6 +30,7 @@ RATES = {
 WINDOW_S = 2.0
 
 
+@pytest.mark.long
 @pytest.mark.alone
 @pytest.mark.parametrize("speed", [0.5, 5.0])
 @pytest.mark.requirement("A-20")
@@ -69,6 +68,7 @@ def test_topics_keep_their_rates_at_the_speed_that_was_asked_for_or_it_says_why_
     assert sim_s / wall_s > 0.7 * speed or told_slow()
 
 
+@pytest.mark.long
 def test_fewer_images_are_drawn_where_the_machine_is_too_slow_and_time_goes_on(bridge, tmp_path) -> None:
     data = yaml.safe_load((robot_folder() / "cameras.yaml").read_text())
     overhead = next(camera for camera in data["cameras"] if camera["name"] == "overhead")
