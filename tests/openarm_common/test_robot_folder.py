@@ -95,7 +95,11 @@ def test_a_scene_in_the_folder_of_the_robot_goes_before_one_of_all_robots(nearer
     own.mkdir()
     (own / "empty.yaml").write_text("table: {top_z: 0.5}")
     assert (load_scene("empty").table.top_z, common.table.top_z) == (0.5, 0.45)
-    refused("calibration, calibration_overhead, calibration_wrist, empty, random", load_scene, "demo")
+    refused(
+        "calibration, calibration_overhead, calibration_overhead_left_arm, calibration_wrist, empty, random",
+        load_scene,
+        "demo",
+    )
 
 
 def test_a_robot_that_does_not_say_where_it_works_has_no_scenes(robots, monkeypatch):
