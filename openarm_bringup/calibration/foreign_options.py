@@ -33,7 +33,7 @@ class Foreign:
         with_: Second file, of the board's poses or corners, where the first has those of the robot alone.
         columns: Names of a table's columns, such as "image x y z qx qy qz qw" (rx ry rz, roll pitch yaw, m00 to m33);
             robot_x, board_x, ... of pairs, - for one to leave out; those of the second file behind a ";".
-        roles: Names of the robot's and of the board's poses in the file, such as A,B; told by names when not given.
+        roles: Names of the robot's and of the board's poses in the file, such as A,B; found by name when not given.
         board: Board in images and corners, such as charuco:7x5:34mm:26mm:DICT_6X6_250, its keys, or a YAML file.
         images: Folder of images, one for each pose.
         intrinsics: Camera of images and corners: camera_info YAML, OpenCV's YAML, XML or JSON, or

@@ -80,7 +80,7 @@ class CalibrationOptions:
         """Return where mounts and zeros are stored."""
         from openarm_calibration.store.store import CalibrationStore
 
-        folder = default_folder() if self.store is None else self.store
+        folder = default_folder() if self.store is None else self.store.expanduser().absolute()
         return CalibrationStore(folder), ZeroStore(self.zeros_store or folder)
 
     @property
@@ -163,16 +163,15 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
     cameras = chosen_cameras(options.cameras)
     domain = reserve_domain() if options.domain is None else options.domain
     sets = [*options.sets, f"calibration.camera={cameras[0]}"]
+    mounts, zeros = options.stores()
     if options.store is not None:
-        folder = options.store.expanduser().absolute()
-        sets += [f"calibration.store={folder}", f"calibration_publisher.store={folder}"]
+        sets += [f"{node}.store={mounts.folder}" for node in ("calibration", "calibration_publisher")]
     places = board_places(cameras, every_arm=options.zeros)
     if options.zeros:
         sets += [f"calibration.auto.search.zeros={_ZEROS}"]
     overrides = {"domain": domain, "scene": places[0].scene, "mount_seed": options.mount_seed}
     graph = load_graph(GRAPH, overrides=overrides, sets=sets)
     run = CalibrationRun(run_dir := runs.new_run_dir())
-    mounts, zeros = options.stores()
     known = zeros.in_use(zeros_name(graph)).record
     keep_zeros(Zeros(robot=known.robot, of=known.of, offsets=known.offsets), run_dir / "zeros")
     listeners = listeners or CalibrationListeners()
@@ -196,10 +195,12 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
                 )  # fmt: skip
                 run.robot_s += result.duration
                 run.results.setdefault(camera, result)
-                if not result.success:
-                    run.results[camera] = result
+                if result.success:
+                    run.sessions.append(session)
+                    continue
+                run.results[camera] = result
+                if options.zeros:  # they need the samples of every board
                     return
-                run.sessions.append(session)
 
     async def work() -> None:
         async with running_graph(graph, run_dir, listeners.on_event) as supervisor:

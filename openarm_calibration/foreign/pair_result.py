@@ -74,7 +74,7 @@ class PairResult:
             f" {solution.noise[0] * 1e3:.3f} mm {math.degrees(solution.noise[1]):.4f}° by axis)",
         ]
         if solution.free.any():
-            lines.append(f"not told     the place along {item.parent}'s {axis_name(solution.free)}: it may be any")
+            lines.append(f"undetermined the place along {item.parent}'s {axis_name(solution.free)}: it may be any")
         x, y, z = (v * 1e3 for v in solution.Z[:3, 3])
         q = "  ".join(f"{v:8.5f}" for v in se3.quat_xyzw_from_matrix(solution.Z[:3, :3]))
         carrier = self.names.base if self.pairs.setup == "in_hand" else self.names.tip
@@ -133,7 +133,7 @@ def pair_result(
         axis = "xyz"[int(np.argmax(np.abs(solution.free)))]
         parent = names.tip if pairs.setup == "in_hand" else names.base
         checks.append((
-            _FAIL, "all rotations are about one axis: five numbers of the camera are told, not its place along"
+            _FAIL, "all rotations are about one axis: five numbers of the camera are determined, not its place along"
             f" {parent}'s {axis_name(solution.free)}; measure it (or touch one point that the camera sees) and give"
             f" --fix {axis}=METRES"
         ))  # fmt: skip

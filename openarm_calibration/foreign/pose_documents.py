@@ -45,7 +45,7 @@ class Column:
         labels: (n,) of the records.
         rotation: Form that the file tells; "" where it does not.
         unit: The same of positions.
-        keys: (n,) what tells which records of two columns belong together; () where nothing does.
+        keys: (n,) what says which records of two columns belong together; () where nothing does.
         stamps: (n,) times, s or ns; () where there are none.
     """
 
@@ -138,7 +138,7 @@ def _poses(value: Any, keys: _Keys) -> Iterator[tuple[_Keys, Array, str]]:
         entries = {key: one for key, one in entries.items() if "joint" not in key.lower()}
         pose = _of_parts(entries)
         if pose is not None:
-            # what stands beside it may be another one
+            # what stands next to it may be another one
             entries = {key: one for key, one in entries.items() if not _PART.fullmatch(key.lower().lstrip("_"))}
             others = any(True for _ in _poses(entries, keys))
             yield (*keys, "rvec tvec") if others else keys, *pose
@@ -249,7 +249,7 @@ def _of_parts(entries: Mapping[str, Any]) -> tuple[Array, str] | None:
 
 
 def _flat(lower: Mapping[str, Any]) -> tuple[Array, str] | None:
-    """Return a pose whose numbers stand beside each other: x y z, and qx qy qz qw, rx ry rz, or roll pitch yaw."""
+    """Return a pose whose numbers stand next to each other: x y z, and qx qy qz qw, rx ry rz, or roll pitch yaw."""
     place = [number(lower.get(letter)) for letter in ("x", "y", "z")]
     if None in place:
         return None

@@ -80,7 +80,7 @@ def read_source(path: Path, other: Path | None = None, columns: str = "", roles:
         path: File, or folder with a file for each pose.
         other: A second one, of the board, where the poses are in two.
         columns: Names of the columns of a table, such as `image x y z qx qy qz qw`; those of the second behind a `;`.
-        roles: Names of the robot's poses and of the board's in the file, such as `A,B`; "": told by their names.
+        roles: Names of the robot's poses and of the board's in the file, such as `A,B`; "": found by their names.
 
     Raises:
         OpenArmError: CONFIG_INVALID, naming what is wrong, and what is read.

@@ -23,7 +23,7 @@ import numpy as np
 from openarm_calibration.handeye.problem import Extra, Problem, chain, design, layout
 from openarm_calibration.handeye.spread import FLOOR, averaged, criterion, search, search_misfit
 from openarm_calibration.handeye.transforms import moved
-from openarm_calibration.handeye.unknowns import FREE, Estimate, Noise, Priors, State, values
+from openarm_calibration.handeye.unknowns import FREE, ZERO_SCALES, Estimate, Noise, Priors, State, values
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -32,8 +32,6 @@ _LOWEST_PX = 1e-3
 _ITERATIONS = 30
 #: Drop of minus twice the log likelihood from which a misfit is accepted: one clean set in two hundred has it.
 _EVIDENT = 6.6
-#: Deviations of the zeros that `with_zeros` tries, rad; each answer starts from the one before.
-_SCALES = tuple(math.radians(degrees) for degrees in (0.03, 0.1, 0.3, 1.0, 3.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,7 +343,7 @@ def with_zeros(problem: Problem, known: Estimate, priors: Priors = FREE) -> Esti
     """
     best = start = known
     worse = 0
-    for scale in _SCALES if problem.joints else ():
+    for scale in ZERO_SCALES[1:] if problem.joints else ():
         wide = replace(priors, zeros=np.full(problem.joints, scale))
         try:
             start = refine(

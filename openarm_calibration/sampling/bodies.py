@@ -132,5 +132,5 @@ def _meets(faces: Array, start: Array, ways: Array) -> bool:
     at = -above / np.where(np.abs(speed) < 1e-12, 1e-12, speed)
     enter = np.where(speed < 0.0, at, -np.inf).max(axis=1)
     leave = np.where(speed > 0.0, at, np.inf).min(axis=1)
-    beside = ((np.abs(speed) < 1e-12) & (above > 0.0)).any(axis=1)
-    return bool(((enter <= leave) & (enter > 0.0) & (enter < 1.0) & ~beside).any())
+    outside = ((np.abs(speed) < 1e-12) & (above > 0.0)).any(axis=1)
+    return bool(((enter <= leave) & (enter > 0.0) & (enter < 1.0) & ~outside).any())
