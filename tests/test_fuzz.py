@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
 from openarm_interfaces.msg import CollisionObject
-from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState, PointCloud2
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory
 from vision_msgs.msg import Detection3DArray
@@ -24,7 +24,7 @@ from benchmarks.fuzz.judge import BOUND_MIB, Tally
 from openarm_bringup.view.ros.layers import _show_robot, _text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros import convert
+from openarm_common.ros import convert, images
 from openarm_common.ros.detections import detections_from_msg
 from openarm_motion.ros import convert as motion
 
@@ -54,9 +54,11 @@ def _solid(message: CollisionObject) -> None:
 _DOORS: list[tuple[type[Any], Callable[[Any], object]]] = [
     (JointState, convert.joints_from_msg),
     (TFMessage, _edges),
-    (Image, convert.rgb_image),
-    (Image, convert.depth_image),
-    (CameraInfo, convert.intrinsics_from_info),
+    (Image, images.rgb_image),
+    (Image, images.depth_image),
+    (CompressedImage, images.rgb_image),
+    (CompressedImage, images.depth_image),
+    (CameraInfo, images.lens_from_info),
     (PointCloud2, convert.points_from_cloud),
     (JointTrajectory, convert.trajectory_from_msg),
     (MarkerArray, convert.held_from_msg),

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
-    from openarm_calibration.foreign.optics import Lens
+    from openarm_common.camera.lens import Lens
 
 CameraKind = Literal["eye_in_hand", "eye_to_hand"]
 Unit = Literal["m", "cm", "mm", "inch"]
@@ -105,10 +105,11 @@ def lens_given(text: str) -> Lens:
     Raises:
         OpenArmError: INVALID_ARGUMENT, when it is none; CONFIG_INVALID and BAD_IMAGE, for a faulty file.
     """
-    from openarm_calibration.foreign.optics import lens_of, read_camera_info
+    from openarm_common.camera.lens import lens_of
+    from openarm_common.camera.lens_files import read_lens
 
     if text.endswith((".yaml", ".yml", ".json", ".xml")):
-        return read_camera_info(Path(text).expanduser())
+        return read_lens(Path(text).expanduser())
     try:
         width, height, fx, fy, cx, cy = (float(part) for part in text.split(","))
     except ValueError as error:

@@ -14,14 +14,14 @@ _WIDE = 150
 
 
 def perceive(
-    color: Path | None = None,
-    depth: Path | None = None,
-    *,
-    info: Path | None = None,
+    *files: Path,
+    info: str = "",
+    color: str = "",
+    depth: str = "",
     camera: str = "",
     start: float = 0.0,
     out: Path | None = None,
-    depth_scale: float = 0.001,
+    depth_scale: float | None = None,
     pose: Path | None = None,
     background: Path | None = None,
     near: float = 0.1,
@@ -31,25 +31,31 @@ def perceive(
 ) -> Outcome:
     """Find what stands on the table in a frame of a depth camera: two images, an organised cloud, a bag, or topics.
 
-    The table is found; with --pose it is level. Depth is aligned with colour. Images of files are rectified. Without a
-    file, it is the next frame of a camera of the running graph, such as a RealSense (its `aligned_depth_to_color`).
+    The table is found; with --pose it is level. Distortion is removed. Depth of topics is aligned with colour by both
+    camera_infos and /tf_static; depth of files must be aligned.
 
     Args:
-        color: Colour image (PNG, JPEG); or an organised cloud (.pcd) or a bag (folder or .mcap), which need nothing
-            else; or nothing, for a camera of the running graph.
-        depth: Depth image: PNG of 16 bits, 0 where nothing was measured.
-        info: Intrinsics of both: YAML of a CameraInfo, or of fx, fy, cx, cy, or three rows of three numbers.
+        files: Colour image (PNG, JPEG) and depth image (PNG of 16 bits, 0 where nothing was measured, or TIFF of
+            floats); or an organised cloud (.pcd); or a bag (folder or .mcap); or nothing, for a camera of the running
+            graph.
+        info: Intrinsics of images, with distortion: YAML of a CameraInfo, of OpenCV or Kalibr, JSON, or three rows of
+            three numbers. Of a bag or graph: topic of the colour image's CameraInfo.
+        color: Topic of the colour image in a bag or graph, also compressed; by the names of drivers when not given.
+        depth: Topic of the depth image in a bag or graph, likewise.
         camera: Namespace of the camera in a bag or graph, such as /camera/camera, or a part of it; the only one when
             not given.
         start: Of a bag, only from this long after its first message on, s.
         out: Folder for pictures, the label image and a page.
-        depth_scale: Metres of a count of the depth image.
+        depth_scale: Metres of a count of depth, of every encoding: 0.0001 for a D405, 0.0002 for TUM, 0.001 for floats
+            in mm; 0.001 for integers and 1 for floats when not given.
         pose: Text file with the camera's pose (optical frame), four rows of four numbers, in a frame whose z is up.
         background: Depth image, or cloud, of the empty table or box from the same place.
         near: Nearest depth that counts, m.
         far: Farthest depth that counts, m.
         timeout: Longest wait for a camera of the running graph, s.
     """
+    from openarm_common.camera.lens import Lens
+    from openarm_common.camera.lens_files import read_lens
     from openarm_common.config import load_config
     from openarm_common.resources import config_dir
     from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
@@ -62,34 +68,38 @@ def perceive(
             Code.INVALID_ARGUMENT, f"--near {near:g} and --far {far:g} m; expected 0 < near < far <= 1000"
         )
     limits = DepthLimits(near=near, far=far)
-    alone = color is None or color.is_dir() or color.suffix.lower() in (".pcd", ".mcap")
-    if alone and (depth is not None or info is not None):
-        what = "the running graph" if color is None else f"{color} is a cloud or a bag"
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{what}; expected no depth image and no --info")
-    if color is None:
-        join_graph(domain)
-        from openarm_bringup.ros.camera_frame import frame_of_graph
+    cloud = len(files) == 1 and files[0].suffix.lower() == ".pcd"
+    bag = len(files) == 1 and (files[0].is_dir() or files[0].suffix.lower() == ".mcap")
+    of_topics = bag or not files
+    if not of_topics and (color or depth or camera):
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, "--color, --depth and --camera are for topics of a bag or of the running graph"
+        )
+    if of_topics:
+        from openarm_bringup.ros.camera_frame import CameraChoice, frame_of_bag, frame_of_graph
 
-        frame = frame_of_graph(camera, limits, depth_scale, timeout)
-    elif color.suffix.lower() == ".pcd":
-        frame = read_cloud(color, limits)
-    elif alone:
-        from openarm_bringup.ros.camera_frame import frame_of_bag
-
-        frame = frame_of_bag(color, camera, limits, depth_scale, start)
-    elif depth is None or info is None:
-        missing = "depth image" if depth is None else "--info"
+        chosen = CameraChoice(camera, color, depth, info, depth_scale, limits)
+        if not bag:
+            join_graph(domain)
+        frame = frame_of_bag(files[0], chosen, start) if bag else frame_of_graph(chosen, timeout)
+    elif cloud:
+        if info:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{files[0]} is a cloud, which needs no --info")
+        frame = read_cloud(files[0], limits)
+    elif len(files) != 2 or not info:
+        missing = "--info" if len(files) == 2 else "depth image" if len(files) == 1 else "such number of files"
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             f"no {missing}; expected COLOUR DEPTH --info INTRINSICS, a cloud that ends in .pcd, or a bag",
         )
     else:
-        frame = read_frame(color, depth, info, depth_scale, limits)
+        frame = read_frame(*files, Path(info), depth_scale, limits)
     empty = None
     if background is not None and background.suffix.lower() == ".pcd":
         empty = read_cloud(background, limits).points
     elif background is not None:
-        empty = read_depth(background, frame.intrinsics, depth_scale, limits)
+        lens = read_lens(Path(info), frame.size) if info and not of_topics else Lens(frame.intrinsics)
+        empty = read_depth(background, lens, depth_scale, limits)
     T_base_camera = None if pose is None else read_pose(pose)
     if out is not None:
         try:

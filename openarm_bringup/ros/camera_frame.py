@@ -3,20 +3,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, Image
+from tf2_msgs.msg import TFMessage
 
 from openarm_bringup.bags.bag import open_bag
-from openarm_bringup.bags.ros.messages import contents, message_of
+from openarm_bringup.bags.ros.messages import contents, message_of, messages_of
+from openarm_bringup.messages import interface
+from openarm_bringup.ros.peer import Frames
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import ContextNode
+from openarm_common.ros.node import QOS_STATIC_TF
 from openarm_perception.frames.images import Frame
 from openarm_perception.geometry.depth import DepthLimits
 from openarm_perception.ros.frames import CameraTopics, FrameBuilder, camera_topics
+
+
+@dataclass(frozen=True)
+class CameraChoice:
+    """Which camera, and what its depth is.
+
+    Attributes:
+        camera: Namespace or a part of it; "": the only one.
+        color: Topic of the colour image; "": found by the names that drivers use.
+        depth: Topic of the depth image, likewise.
+        info: Topic of the CameraInfo of the colour image, likewise.
+        depth_scale: Metres of a count of depth; None as for `metres`.
+        limits: Depths that count.
+    """
+
+    camera: str = ""
+    color: str = ""
+    depth: str = ""
+    info: str = ""
+    depth_scale: float | None = None
+    limits: DepthLimits = field(default_factory=DepthLimits)
+
+    def topics(self, kinds: Mapping[str, str]) -> CameraTopics:
+        """Return its topics among those that there are, types by topic; errors as `camera_topics`."""
+        return camera_topics(kinds, self.camera, color=self.color, depth=self.depth, info=self.info)
+
+    def builder(self, topics: CameraTopics, frames: Frames) -> FrameBuilder:
+        """Return a builder of frames of these topics."""
+        return FrameBuilder(topics, self.limits, self.depth_scale, frames.between)
 
 
 class _Camera(ContextNode):
@@ -24,31 +58,35 @@ class _Camera(ContextNode):
 
     def __init__(self) -> None:
         super().__init__("perceive", bare=True)
+        self._frames = Frames()
         self._frame: Frame | None = None
         self._fault: OpenArmError | None = None
 
-    def frame(self, camera: str, limits: DepthLimits, depth_scale: float, timeout: float) -> Frame:
-        self.spin_until(partial(self._topics, camera), timeout)
-        topics = self._topics(camera) or camera_topics(self._names(), camera)  # raises: says what there is
-        builder = FrameBuilder(topics, limits, depth_scale)
-        for topic, kind in zip(topics, (Image, Image, CameraInfo), strict=True):
+    def frame(self, chosen: CameraChoice, timeout: float) -> Frame:
+        self._node.create_subscription(TFMessage, "/tf_static", self._take_static, QOS_STATIC_TF)
+        self.spin_until(partial(self._topics, chosen), timeout)
+        kinds = self._kinds()
+        topics = self._topics(chosen) or chosen.topics(kinds)  # raises: says what there is
+        builder = chosen.builder(topics, self._frames)
+        for topic in filter(None, topics):
             take = partial(self._take, builder, topic)
-            self._node.create_subscription(kind, topic, take, qos_profile_sensor_data)
-        self.spin_until(lambda: self._frame or self._fault, timeout)
-        if self._fault is not None:
-            raise self._fault
-        if self._frame is None:
-            raise OpenArmError(Code.TIMEOUT, f"no frame within {timeout:g} s: {builder.missing()}")
-        return self._frame
+            self._node.create_subscription(interface(kinds[topic]), topic, take, qos_profile_sensor_data)
+        self.spin_until(lambda: self._frame or (self._fault and self._fault.code is not Code.NO_TRANSFORM), timeout)
+        if self._frame is not None:
+            return self._frame
+        raise self._fault or OpenArmError(Code.TIMEOUT, f"no frame within {timeout:g} s: {builder.missing()}")
 
-    def _names(self) -> set[str]:
-        return {name for name, _ in self._node.get_topic_names_and_types()}
+    def _kinds(self) -> dict[str, str]:
+        return {name: kinds[0] for name, kinds in self._node.get_topic_names_and_types()}
 
-    def _topics(self, camera: str) -> CameraTopics | None:
+    def _topics(self, chosen: CameraChoice) -> CameraTopics | None:
         try:
-            return camera_topics(self._names(), camera)
+            return chosen.topics(self._kinds())
         except OpenArmError:
             return None
+
+    def _take_static(self, message: TFMessage) -> None:
+        self._frames.add(message, 0, True)
 
     def _take(self, builder: FrameBuilder, topic: str, message: Any) -> None:
         try:
@@ -57,46 +95,45 @@ class _Camera(ContextNode):
             self._fault = error
 
 
-def frame_of_graph(camera: str, limits: DepthLimits, depth_scale: float, timeout: float) -> Frame:
+def frame_of_graph(chosen: CameraChoice, timeout: float) -> Frame:
     """Return the next frame of a camera of the running graph.
 
     Args:
-        camera: Namespace or a part of it; "": the only one.
-        limits: Depths that count.
-        depth_scale: Metres of a count of integer depth.
+        chosen: Which camera.
         timeout: Longest wait for topics, and for the frame, s.
 
     Raises:
-        OpenArmError: NOTHING_DETECTED or INVALID_ARGUMENT, as `camera_topics`; TIMEOUT; BAD_IMAGE.
+        OpenArmError: NOTHING_DETECTED or INVALID_ARGUMENT, as `camera_topics`; TIMEOUT; BAD_IMAGE; NO_TRANSFORM.
     """
     with _Camera() as listener:
-        return listener.frame(camera, limits, depth_scale, timeout)
+        return listener.frame(chosen, timeout)
 
 
-def frame_of_bag(path: Path, camera: str, limits: DepthLimits, depth_scale: float, start_s: float) -> Frame:
+def frame_of_bag(path: Path, chosen: CameraChoice, start_s: float) -> Frame:
     """Return the first frame of a camera in a bag.
 
     Args:
         path: rosbag2 folder or MCAP file.
-        camera: Namespace or a part of it; "": the only one.
-        limits: Depths that count.
-        depth_scale: Metres of a count of integer depth.
+        chosen: Which camera.
         start_s: Only from this long after the first message on.
 
     Raises:
         OpenArmError: NOTHING_DETECTED or INVALID_ARGUMENT, as `camera_topics`, for what is no bag, or when it has no
-            such frame; BAD_IMAGE.
+            such frame; BAD_IMAGE; NO_TRANSFORM.
     """
     with open_bag(path) as bag:
-        topics = camera_topics(bag.topics, camera)
-        builder = FrameBuilder(topics, limits, depth_scale)
-        # camera_info may have come once, before the time that is asked for
-        infos = bag.records([topics.info])
+        topics = chosen.topics({topic: kind for topic, (kind, _) in bag.topics.items()})
+        frames = Frames()
         with contents(bag):
-            for record in infos:
-                builder.take(record.topic, message_of(bag, record))
-                break
-            for record in bag.records(list(topics), start_s):
+            for message in messages_of(bag, ["/tf_static"])["/tf_static"]:
+                frames.add(message, 0, True)
+            builder = chosen.builder(topics, frames)
+            # camera_info may have come once, before the time that is asked for
+            for info in filter(None, (topics.info, topics.depth_info)):
+                for record in bag.records([info]):
+                    builder.take(record.topic, message_of(bag, record))
+                    break
+            for record in bag.records([topic for topic in topics if topic], start_s):
                 frame = builder.take(record.topic, message_of(bag, record))
                 if frame is not None:
                     return frame

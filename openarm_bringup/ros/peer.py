@@ -21,6 +21,7 @@ from tf2_msgs.msg import TFMessage
 from openarm_bringup.messages import to_data
 from openarm_bringup.suggest import unknown
 from openarm_bringup.supervision import runs
+from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import ActionClient
 from openarm_common.ros.client import ContextNode
@@ -225,6 +226,22 @@ class Frames:
                     self.clashes[name] = f"has two publishers on {'/tf_static' if static else '/tf'}"
             self.edges[name] = (parent, T, static)
             self._last[name] = number
+
+    def between(self, target: str, source: str) -> NDArray[np.float64] | None:
+        """Return the pose (4, 4) of a frame in another one; None where no edges tie them."""
+        to_root = {frame: self._in_root(frame) for frame in (target, source)}
+        if to_root[target][0] != to_root[source][0]:
+            return None
+        return se3.inverse(to_root[target][1]) @ to_root[source][1]
+
+    def _in_root(self, frame: str) -> tuple[str, NDArray[np.float64]]:
+        """Return the frame above which there is none, and the pose in it."""
+        named, T, seen = {name.lstrip("/"): edge for name, edge in self.edges.items()}, np.eye(4), set[str]()
+        while frame in named and frame not in seen:
+            seen.add(frame)
+            parent, T_parent_frame, _ = named[frame]
+            frame, T = parent.lstrip("/"), T_parent_frame @ T
+        return frame, T
 
 
 class ParametersOf:

@@ -19,8 +19,9 @@ from openarm_calibration.board.squares import AprilGrid, Charuco, Chessboard
 from openarm_calibration.handeye.problem import fit_poses
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.lens import Lens
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.types import Array
+from openarm_common.types import Array, Bytes
 
 
 def detect(board: Board, image: Grey) -> BoardDetection:
@@ -45,6 +46,21 @@ def detect(board: Board, image: Grey) -> BoardDetection:
     if isinstance(board, AprilGrid):
         return detect_aprilgrid(board, image)
     return detect_marker(board, image)
+
+
+def detect_undistorted(board: Board, image: Bytes, lens: Lens) -> tuple[BoardDetection, Bytes]:
+    """Detect a board; return its marks, and the image, as a camera without the lens's distortion shows them.
+
+    Args:
+        board: Board to find.
+        image: (h, w) grey, as the camera took it.
+        lens: Lens of the camera.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED; BAD_IMAGE, for an image of another size, or a distortion without an inverse.
+    """
+    seen = detect(board, image)
+    return BoardDetection(seen.ids, lens.undistorted(seen.pixels), seen.residual), lens.rectified(image)
 
 
 def guess_pose(points: Array, pixels: Array, radius: float, intrinsics: Intrinsics) -> tuple[Array, float]:

@@ -8,10 +8,11 @@ from xml.sax.saxutils import quoteattr
 
 import yaml
 
-from openarm_calibration.foreign.optics import Lens, camera_info
 from openarm_calibration.store.store import StoredCalibration
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
+from openarm_common.camera.lens import Lens
+from openarm_common.camera.lens_files import camera_info
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 

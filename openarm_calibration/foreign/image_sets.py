@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from dataclasses import astuple, dataclass, replace
 from functools import partial
@@ -12,17 +11,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.board.board import Board
 from openarm_calibration.board.circles import SymmetricCircles
-from openarm_calibration.board.detect import detect, guess_pose
+from openarm_calibration.board.detect import detect_undistorted, guess_pose
 from openarm_calibration.board.detection import BoardDetection, plane_fit
 from openarm_calibration.board.orientation import fronts
 from openarm_calibration.board.squares import Chessboard
 from openarm_calibration.foreign.conventions import Convention
 from openarm_calibration.foreign.explain import BOARD_FRAMES, Poses, Tried, decided, search, table
-from openarm_calibration.foreign.optics import Lens
 from openarm_calibration.foreign.pose_robot import joints_of_pose, robot_of_poses
 from openarm_calibration.foreign.pose_source import Source
 from openarm_calibration.handeye.consensus import agreed
@@ -30,9 +27,11 @@ from openarm_calibration.handeye.problem import Setup
 from openarm_calibration.handeye.transforms import inverses
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3
+from openarm_common.camera.lens import Lens
+from openarm_common.camera.pictures import decode_picture, to_bytes
 from openarm_common.config import validate
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.types import Array
+from openarm_common.types import Array, Bytes
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 #: Largest image file, bytes.
@@ -67,7 +66,7 @@ class ImageSet:
         return "\n".join(["images, and the sample of each", *lines, "", table(self.tried)])
 
 
-def image_of(path: Path, lens: Lens) -> NDArray[np.uint8]:
+def image_of(path: Path, lens: Lens) -> Bytes:
     """Read an image in grey; errors as `grey_of`."""
     try:
         if path.stat().st_size > _LARGEST:
@@ -78,49 +77,25 @@ def image_of(path: Path, lens: Lens) -> NDArray[np.uint8]:
     return grey_of(data, lens, str(path))
 
 
-def grey_of(data: bytes, lens: Lens, where: str) -> NDArray[np.uint8]:
+def grey_of(data: bytes, lens: Lens, where: str) -> Bytes:
     """Decode an image file in grey.
 
     Args:
-        data: PNG, JPEG and the like.
-        lens: Camera whose size it must have; its header is asked before anything is unpacked.
-        where: Begins the error.
+        data: Content of a PNG, JPEG or the like.
+        lens: Camera whose size it must have.
+        where: Subject of the error.
 
     Raises:
         OpenArmError: BAD_IMAGE, when it is none, damaged, or of another size than the intrinsics.
     """
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(data)) as header:
-            size = header.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise OpenArmError(Code.BAD_IMAGE, f"{where} is no image that can be read: {type(error).__name__}") from error
-    k = lens.intrinsics
-    if size != (k.width, k.height):
+    picture, k = to_bytes(decode_picture(data, where)), lens.intrinsics
+    if picture.shape[:2] != (k.height, k.width):
         raise OpenArmError(
-            Code.BAD_IMAGE, f"{where} has {size[0]}x{size[1]} pixels, the intrinsics are of {k.width}x{k.height}"
+            Code.BAD_IMAGE,
+            f"{where} has {picture.shape[1]}x{picture.shape[0]} pixels, the intrinsics are of {k.width}x{k.height}",
         )
-    grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if grey is None or grey.shape != (k.height, k.width):  # pyright: ignore[reportUnnecessaryComparison]
-        raise OpenArmError(Code.BAD_IMAGE, f"{where} is damaged")
-    return grey.astype(np.uint8)
-
-
-def found_in(board: Board, image: NDArray[np.uint8], lens: Lens) -> tuple[BoardDetection, Array]:
-    """Return the marks of a board without the lens's distortion, and T_camera_board (4, 4) by them.
-
-    Args:
-        board: Board to find.
-        image: (h, w) grey, as the camera took it.
-        lens: Lens of the camera.
-
-    Raises:
-        OpenArmError: NOTHING_DETECTED; BAD_IMAGE.
-    """
-    seen = detect(board, image)
-    detection = BoardDetection(seen.ids, lens.undistorted(seen.pixels), seen.residual)
-    return detection, guess_pose(board.points[seen.ids], detection.pixels, board.radius, lens.intrinsics)[0]
+    to_grey = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
+    return picture if picture.ndim == 2 else cv2.cvtColor(picture, to_grey[picture.shape[2]]).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +190,9 @@ def _read_alike(ways: list[list[_View]], robot: Poses, setup: Setup) -> tuple[li
 def _look(file: Path, board: Board, lens: Lens) -> list[_View]:
     """Return the board in an image, in each way in which it can be read; as it stands upright first."""
     image = image_of(file, lens)
-    detection, C = found_in(board, image, lens)
-    png = cv2.imencode(".png", lens.rectified(image))[1].tobytes()
+    detection, straight = detect_undistorted(board, image, lens)
+    C, _ = guess_pose(board.points[detection.ids], detection.pixels, board.radius, lens.intrinsics)
+    png = cv2.imencode(".png", straight)[1].tobytes()
     out = [_View(detection, C, png)]
     grid = isinstance(board, Chessboard | SymmetricCircles) and board.ambiguity
     if grid and len(detection.ids) == len(board.points):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from openarm_calibration.foreign.documents import number
+from openarm_common.documents import number
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 

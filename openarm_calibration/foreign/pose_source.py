@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from openarm_calibration.foreign.documents import DOCUMENTS, TABLES, number, read_cells, read_document
 from openarm_calibration.foreign.pose_documents import MOST, Column, searched
 from openarm_calibration.foreign.pose_tables import of_table
 from openarm_calibration.handeye.problem import Setup
+from openarm_common.documents import DOCUMENTS, TABLES, number, read_cells, read_document
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 from openarm_common.types import Array

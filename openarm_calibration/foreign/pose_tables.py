@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from openarm_calibration.foreign.documents import Cells, is_missing, number
 from openarm_calibration.foreign.pose_documents import MOST, Column
+from openarm_common.documents import Cells, is_missing, number
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 from openarm_common.types import Array

@@ -8,9 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, Image
 
@@ -18,7 +15,6 @@ from openarm_calibration.config import CalibrationConfig
 from openarm_common.camera.stream import Frame
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.camera_stream import CameraStream
-from openarm_common.ros.convert import image_to_array, rgb_image
 from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
 
@@ -133,14 +129,3 @@ async def wait_until(node: BaseNode[Any], condition: Callable[[], bool], timeout
         return bool(await future)
     finally:
         node.destroy_timer(timer)
-
-
-def grey(message: Image) -> NDArray[np.uint8]:
-    """Return the grey picture (h, w) of an image message.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, for an encoding that is no colour or grey picture of 8 bits.
-    """
-    if message.encoding == "mono8":
-        return np.ascontiguousarray(image_to_array(message)).astype(np.uint8)
-    return cv2.cvtColor(rgb_image(message), cv2.COLOR_RGB2GRAY).astype(np.uint8)

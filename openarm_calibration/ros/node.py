@@ -28,12 +28,12 @@ from openarm_interfaces.srv import (
 )
 
 from openarm_calibration.board.board import read_board
-from openarm_calibration.board.detect import BoardDetection, detect
+from openarm_calibration.board.detect import BoardDetection, detect_undistorted
 from openarm_calibration.config import CalibrationConfig
 from openarm_calibration.handeye.closed_form import ALGORITHMS, checked_algorithm
 from openarm_calibration.handeye.offline import Result, calibrate
 from openarm_calibration.ros.auto_server import AutoCalibrateServer, fill
-from openarm_calibration.ros.image_capture import ImageCapture, grey
+from openarm_calibration.ros.image_capture import ImageCapture
 from openarm_calibration.sampling.gate import Matched, match
 from openarm_calibration.sampling.next_pose import advice
 from openarm_calibration.sampling.samples import SESSION_SUFFIXES, Sample, SampleSet, SessionHead, head_of, load_session
@@ -43,7 +43,7 @@ from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder, now
 from openarm_common.ros.answers import answer_async
-from openarm_common.ros.convert import intrinsics_from_info
+from openarm_common.ros.images import grey_image, lens_from_info
 from openarm_common.ros.node import BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
 
@@ -118,10 +118,11 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
             OpenArmError: NOT_READY, STALE_DATA, MOVING, NOTHING_DETECTED, BAD_IMAGE.
         """
         frame = await self.capture.take(self.config.gate.track if moving else 0.0)
-        pixels, t_ns = grey(frame.items["image"]), frame.t_ns
-        self._check_optics(intrinsics_from_info(frame.items["camera_info"]))
+        pixels, t_ns = grey_image(frame.items["image"]), frame.t_ns
+        lens = lens_from_info(frame.items["camera_info"])
+        self._check_optics(lens.intrinsics)
         matched = match(self._states.buffer, t_ns, self.samples.joint_names, self.config.gate, moving=moving)
-        return t_ns, matched, await self.in_thread(detect, self.samples.board, pixels), pixels
+        return t_ns, matched, *await self.in_thread(detect_undistorted, self.samples.board, pixels, lens)
 
     async def take(self) -> Sample:
         """Take a sample; errors as `observe`."""

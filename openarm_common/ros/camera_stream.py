@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from openarm_common.camera.stream import Frame, FrameStream
 from openarm_common.errors import OpenArmError
@@ -18,8 +18,6 @@ from openarm_common.ros.node import QOS_NEWEST, BaseNode, best_effort
 from openarm_common.ros.polled import Polled, Source
 from openarm_common.ros.tf import RobotStateListener
 
-#: Message types of the streams of a camera.
-_KINDS: Mapping[str, type] = {"color": Image, "depth": Image, "info": CameraInfo}
 #: Of streams that wait: of the newest stamp, some may still be on their way.
 _WAITING = best_effort(2)
 
@@ -27,11 +25,18 @@ _WAITING = best_effort(2)
 def camera_topics(camera: str, **topics: str) -> dict[str, tuple[type, str]]:
     """Return the message type and topic of the streams `color`, `depth` and `info` of a camera.
 
+    A topic of image_transport that ends in /compressed or /compressedDepth has compressed images.
+
     Args:
         camera: Its name, filled in for {camera}.
         topics: Of the streams.
     """
-    return {stream: (_KINDS[stream], topic.format(camera=camera)) for stream, topic in topics.items()}
+    named = {stream: topic.format(camera=camera) for stream, topic in topics.items()}
+    return {stream: (CameraInfo if stream == "info" else _kind(topic), topic) for stream, topic in named.items()}
+
+
+def _kind(topic: str) -> type:
+    return CompressedImage if topic.endswith(("/compressed", "/compressedDepth")) else Image
 
 
 class CameraStream:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages to numpy and back.
 
-Data fields are filled from `array.array`, which rclpy takes without a check of each element (an ndarray costs 187 ms
-for a 640×480 depth image, an `array.array` 0.2 ms); they are read through views without a copy.
+Data fields are filled from `array.array`, which rclpy takes without a check of each element; they are read through
+views without a copy. Images are in `images`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ import array
 import math
 import sys
 from collections.abc import Sequence
-from typing import cast
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Vector3
 from numpy.typing import ArrayLike, NDArray
 from rclpy.duration import Duration as RclDuration
-from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2, PointField
+from sensor_msgs.msg import CameraInfo, JointState, PointCloud2, PointField
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
@@ -30,15 +29,6 @@ from openarm_common.printable import brief, brief_text
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import LONGEST_NAME
 from openarm_common.types import Array, Bytes, Floats
-
-#: encoding: (dtype, channels)
-ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
-    "rgb8": (np.uint8, 3),
-    "bgr8": (np.uint8, 3),
-    "mono8": (np.uint8, 1),
-    "16UC1": (np.uint16, 1),
-    "32FC1": (np.float32, 1),
-}
 
 #: Nothing that a message speaks of is further away, m.
 _FAR = 1e4
@@ -133,104 +123,7 @@ def matrix_to_transform(parent: str, child: str, T_parent_child: Array, t_ns: in
     return TransformStamped(header=header(parent, t_ns), child_frame_id=child, transform=transform)
 
 
-# --- images
-def image_to_array(message: Image) -> NDArray[np.generic]:
-    """View an image as an array (height, width) or (height, width, 3), dtype by encoding; not a copy.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, when the encoding is unknown or the data do not have the size that the header says.
-    """
-    if message.encoding not in ENCODINGS:
-        raise _bad_image(f"image encoding {brief(message.encoding)} is not supported; valid: {', '.join(ENCODINGS)}")
-    dtype, channels = ENCODINGS[message.encoding]
-    size = np.dtype(dtype).itemsize
-    row = message.width * channels * size
-    if message.height == 0 or row == 0 or message.step < row or len(message.data) != message.step * message.height:
-        raise _bad_image(
-            f"image {message.width}×{message.height} {message.encoding} has step {message.step} and {len(message.data)}"
-            f" bytes, expected step >= {row} and step × height bytes"
-        )
-    rows = np.frombuffer(message.data, dtype=np.uint8).reshape(message.height, message.step)[:, :row]
-    if size > 1 and bool(message.is_bigendian) != (sys.byteorder == "big"):
-        return np.ascontiguousarray(rows).view(np.dtype(dtype).newbyteorder()).astype(dtype).reshape(message.height, -1)
-    pixels = (rows if rows.flags.c_contiguous else np.ascontiguousarray(rows)).view(dtype)
-    shape = (message.height, message.width, channels) if channels > 1 else (message.height, message.width)
-    return pixels.reshape(shape)
-
-
-def _bad_image(message: str) -> OpenArmError:
-    return OpenArmError(Code.BAD_IMAGE, message)
-
-
-def array_to_image(pixels: NDArray[np.generic], encoding: str, frame_id: str, t_ns: int) -> Image:
-    """Make the image message of an array; dtype and channels must be those of the encoding.
-
-    Args:
-        pixels: (height, width) or (height, width, channels).
-        encoding: Of `ENCODINGS`.
-        frame_id: Optical frame.
-        t_ns: Stamp.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, when they are not.
-    """
-    dtype, channels = ENCODINGS[encoding]
-    if pixels.dtype != dtype or (pixels.shape[2] if pixels.ndim == 3 else 1) != channels:
-        raise _bad_image(f"{encoding} needs {channels} × {dtype.__name__}, got {pixels.dtype} {pixels.shape}")
-    height, width = pixels.shape[:2]
-    message = Image(header=header(frame_id, t_ns), height=height, width=width, encoding=encoding)
-    message.is_bigendian = int(sys.byteorder == "big")
-    message.step = width * channels * pixels.itemsize
-    message.data = byte_array(pixels)
-    return message
-
-
-def byte_array(data: NDArray[np.generic]) -> array.array[int]:
-    """Copy an array into `array.array('B')`, the one form that rclpy takes without a loop."""
-    out = array.array("B")
-    if data.size:  # an empty memoryview can't be cast
-        out.frombytes(np.ascontiguousarray(data).data.cast("B"))
-    return out
-
-
-def rgb_image(message: Image) -> Bytes:
-    """Return a colour image as (height, width, 3), red first; a view where the message has that order.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, for another encoding, or from `image_to_array`.
-    """
-    pixels = cast("NDArray[np.uint8]", image_to_array(message))
-    if message.encoding not in ("rgb8", "bgr8"):
-        raise _bad_image(f"colour image is {message.encoding!r}; valid: rgb8, bgr8")
-    return pixels if message.encoding == "rgb8" else np.ascontiguousarray(pixels[..., ::-1])
-
-
-def depth_image(message: Image) -> NDArray[np.uint16] | Floats:
-    """Return a depth image as (height, width) in counts of its encoding: uint16 mm or float32 m; a view.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, for another encoding, or from `image_to_array`.
-    """
-    if message.encoding not in ("16UC1", "32FC1"):
-        raise _bad_image(f"depth encoding {message.encoding!r} is not supported; valid: 16UC1, 32FC1")
-    return cast("NDArray[np.uint16]", image_to_array(message))
-
-
-def intrinsics_from_info(info: CameraInfo) -> Intrinsics:
-    """Read the intrinsics of a rectified camera.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, when the camera is not calibrated (K is zero) or has distortion that is not removed.
-    """
-    k, name = info.k, f"camera_info of {info.header.frame_id!r}"
-    intrinsics = Intrinsics(info.width, info.height, k[0], k[4], k[2], k[5])
-    if fault := intrinsics.fault():
-        raise _bad_image(f"{name} is not calibrated: {fault}")
-    if any(d != 0.0 for d in info.d):
-        raise _bad_image(f"{name} has distortion {brief(list(info.d))}; rectify the image first")
-    return intrinsics
-
-
+# --- cameras
 def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int, baseline: float = 0.0) -> CameraInfo:
     """Make the CameraInfo of a camera without distortion.
 
@@ -251,6 +144,14 @@ def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int, basel
 
 
 # --- clouds
+def byte_array(data: NDArray[np.generic]) -> array.array[int]:
+    """Copy an array into `array.array('B')`, the one form that rclpy takes without a loop."""
+    out = array.array("B")
+    if data.size:  # an empty memoryview can't be cast
+        out.frombytes(np.ascontiguousarray(data).data.cast("B"))
+    return out
+
+
 def cloud_from_points(points: Floats, frame_id: str, t_ns: int, rgb: Bytes | None = None) -> PointCloud2:
     """Make a PointCloud2 of points (n, 3) or, organised, (height, width, 3), m; NaN marks an invalid point.
 

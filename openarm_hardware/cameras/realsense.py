@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.lens import Lens, lens_of
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_hardware.cameras.config import RealsenseConfig
-from openarm_hardware.cameras.rectify import DistortionModel, Rectifier
 from openarm_hardware.cameras.source import CameraFrame, ImuReading
 
 _INSTALL = "install the extra `realsense`: .venv/bin/uv pip install --require-hashes -r requirements-realsense.lock"
@@ -64,7 +64,7 @@ class RealSense:
     @property
     def intrinsics(self) -> Intrinsics:
         """See `CameraSource.intrinsics`."""
-        return self._intrinsics
+        return self._lens.intrinsics
 
     def open(self) -> str:
         """See `CameraSource.open`."""
@@ -74,10 +74,7 @@ class RealSense:
             color = self._profile(rs.stream.color, (rs.format.rgb8, rs.format.bgr8))
             depth = self._profile(rs.stream.depth, (rs.format.z16,))
             self._swapped = color[1].format() == rs.format.bgr8
-            optics = color[1].as_video_stream_profile().get_intrinsics()
-            self._intrinsics = Intrinsics(optics.width, optics.height, optics.fx, optics.fy, optics.ppx, optics.ppy)
-            model: DistortionModel = "inverse" if optics.model == rs.distortion.inverse_brown_conrady else "brown"
-            self._rectifier = Rectifier(self._intrinsics, np.array(optics.coeffs, np.float64), model)
+            self._lens = lens_of_librealsense(color[1].as_video_stream_profile().get_intrinsics())
             self._millimetres = 1e3 * self._depth_unit(depth[0])
             self._align, self._frames = rs.align(rs.stream.color), rs.syncer(2)
             for sensor, profiles in _by_sensor((color, depth)):
@@ -112,8 +109,8 @@ class RealSense:
             pixels = pixels[..., ::-1]
         if abs(self._millimetres - 1.0) > 1e-6:
             distances = np.minimum(np.rint(distances * self._millimetres), 65535.0).astype(np.uint16)
-        picture = self._rectifier.color(np.ascontiguousarray(pixels))
-        return CameraFrame(t_ns, picture, self._rectifier.depth(distances), tuple(self._imu_readings()))
+        picture = self._lens.rectified(np.ascontiguousarray(pixels))
+        return CameraFrame(t_ns, picture, self._lens.rectified_depth(distances), tuple(self._imu_readings()))
 
     def close(self) -> None:
         """See `CameraSource.close`."""
@@ -197,6 +194,16 @@ class RealSense:
                 self._acceleration = value
             elif self._acceleration is not None:
                 yield ImuReading(_stamp_ns(rs, motion), value, self._acceleration)
+
+
+def lens_of_librealsense(optics: Any) -> Lens:
+    """Return the lens of `rs2_intrinsics`.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, for a model that has no picture without distortion.
+    """
+    k = (optics.fx, 0.0, optics.ppx, 0.0, optics.fy, optics.ppy, 0.0, 0.0, 1.0)
+    return lens_of((optics.width, optics.height), k, optics.model.name, optics.coeffs, "the RealSense")
 
 
 def _by_sensor(chosen: tuple[tuple[Any, Any], ...]) -> list[tuple[Any, list[Any]]]:

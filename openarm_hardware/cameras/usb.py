@@ -5,53 +5,15 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
-import numpy as np
-from pydantic import Field
 
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.config import Config, load_yaml, validate
+from openarm_common.camera.lens_files import read_lens
 from openarm_common.errors import Code, OpenArmError
 from openarm_hardware.cameras.config import UsbConfig
-from openarm_hardware.cameras.rectify import Rectifier
 from openarm_hardware.cameras.source import CameraFrame
-
-
-class _Matrix(Config):
-    rows: int
-    cols: int
-    data: tuple[float, ...]
-
-
-class _CameraInfo(Config):
-    image_width: Annotated[int, Field(gt=0)]
-    image_height: Annotated[int, Field(gt=0)]
-    camera_name: str = ""
-    camera_matrix: _Matrix
-    distortion_model: str = "plumb_bob"
-    distortion_coefficients: _Matrix
-    rectification_matrix: _Matrix | None = None
-    projection_matrix: _Matrix | None = None
-
-
-def read_camera_info(path: Path) -> tuple[Intrinsics, Rectifier]:
-    """Read intrinsics from the file that `camera_calibration` and `camera_info_manager` write.
-
-    Raises:
-        OpenArmError: CONFIG_INVALID, naming file and key.
-    """
-    info = validate(_CameraInfo, load_yaml(path), str(path))
-    if info.distortion_model not in ("plumb_bob", "rational_polynomial"):
-        text = f"{path}:distortion_model: {info.distortion_model!r}, expected plumb_bob or rational_polynomial"
-        raise OpenArmError(Code.CONFIG_INVALID, text)
-    if len(k := info.camera_matrix.data) != 9:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{path}:camera_matrix.data: {len(k)} numbers, expected 9")
-    intrinsics = Intrinsics(info.image_width, info.image_height, k[0], k[4], k[2], k[5])
-    if fault := intrinsics.fault():
-        raise OpenArmError(Code.CONFIG_INVALID, f"{path}:camera_matrix: {fault}")
-    return intrinsics, Rectifier(intrinsics, np.array(info.distortion_coefficients.data))
 
 
 class UsbCamera:
@@ -71,17 +33,13 @@ class UsbCamera:
             text = "the parameter calibration is empty; it names the file of the camera's intrinsics (docs/hardware.md)"
             raise OpenArmError(Code.CONFIG_INVALID, text)
         self._config, path = config, Path(config.calibration)
-        self._intrinsics, self._rectifier = read_camera_info(path)
-        got, asked = (self._intrinsics.width, self._intrinsics.height), (config.width, config.height)
-        if got != asked:
-            text = f"{path} is of pictures of {got[0]}x{got[1]}, the camera is asked for {asked[0]}x{asked[1]}"
-            raise OpenArmError(Code.CONFIG_INVALID, text)
+        self._lens = read_lens(path, (config.width, config.height))
         self._capture: Any = None
 
     @property
     def intrinsics(self) -> Intrinsics:
         """See `CameraSource.intrinsics`."""
-        return self._intrinsics
+        return self._lens.intrinsics
 
     def open(self) -> str:
         """See `CameraSource.open`."""
@@ -114,7 +72,7 @@ class UsbCamera:
         good, picture = self._capture.retrieve()
         if not good:
             return None
-        return CameraFrame(t_ns, self._rectifier.color(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)))  # pyright: ignore
+        return CameraFrame(t_ns, self._lens.rectified(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)))  # pyright: ignore
 
     def close(self) -> None:
         """See `CameraSource.close`."""

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Image, Imu
 
-from openarm_common.ros.convert import array_to_image, header, info_from_intrinsics, vector
+from openarm_common.ros.convert import header, info_from_intrinsics, vector
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_SENSOR, BaseNode, until_shutdown
 from openarm_hardware.cameras.config import CameraNodeConfig
 from openarm_hardware.cameras.feed import CameraFeed

@@ -15,7 +15,8 @@ from openarm_common.camera.stream import Frame
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.posture import JointNeed
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
-from openarm_common.ros.convert import depth_image, intrinsics_from_info, points_from_cloud
+from openarm_common.ros.convert import points_from_cloud
+from openarm_common.ros.images import depth_of
 from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
 from openarm_octomap.grid import CloudScan, DepthScan
@@ -117,8 +118,8 @@ def depth_source(
     """
 
     def to_scan(frame: Frame[Any]) -> DepthScan:
-        depth, intrinsics = depth_image(frame.items["depth"]), intrinsics_from_info(frame.items["info"])
-        return DepthScan(depth, intrinsics, frame.posture.T_base_frame, camera.near, camera.far)
+        depth, lens = depth_of(frame.items["depth"], frame.items["info"])
+        return DepthScan(depth, lens.intrinsics, frame.posture.T_base_frame, camera.near, camera.far)
 
     inputs = camera_topics(camera.name, **topics)
     return Source(camera.name, CameraStream(node, states, inputs, camera.optical_frame, joints=joints), to_scan)

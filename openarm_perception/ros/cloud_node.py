@@ -13,14 +13,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from openarm_common.camera.cameras import depth_camera
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.camera.stream import Frame
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
-from openarm_common.ros.convert import cloud_from_points, depth_image, intrinsics_from_info, rgb_image
+from openarm_common.ros.convert import cloud_from_points
+from openarm_common.ros.images import AnyImage, color_of, depth_of
 from openarm_common.ros.node import QOS_SENSOR, BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_perception.config import CloudNodeConfig
@@ -78,8 +79,8 @@ class _Camera:
     def _take(self, frame: Frame[Any]) -> None:
         try:
             started = time.perf_counter()
-            pixels = self._node.filter.depth(depth_image(frame.items["depth"]))
-            intrinsics = intrinsics_from_info(frame.items["info"])
+            depth, lens = depth_of(frame.items["depth"], frame.items["info"])
+            pixels, intrinsics = self._node.filter.depth(depth), lens.intrinsics
             if self._finder is not None:
                 limits = self._deprojector.limits
                 view = DepthView(pixels, intrinsics, frame.posture.T_base_frame, limits.near, limits.far)
@@ -109,12 +110,12 @@ class _Camera:
         return {f"{name}_frames": self._frames, f"{name}_ms": f"{self._elapsed_ms:.2f}", **given_up, **removed}
 
 
-def _colors(message: Image, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    rgb = rgb_image(message)
+def _colors(message: AnyImage, info: CameraInfo, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    rgb, _ = color_of(message, info)
     if rgb.shape[:2] != shape[:2]:
         raise OpenArmError(
             Code.BAD_IMAGE,
-            f"colour image is {message.width}x{message.height}; expected that of the depth, {shape[1]}x{shape[0]}",
+            f"colour image is {rgb.shape[1]}x{rgb.shape[0]}; expected that of the depth, {shape[1]}x{shape[0]}",
         )
     return rgb
 
@@ -150,7 +151,7 @@ class CloudNode(BaseNode[CloudNodeConfig]):
     def _publisher(self, name: str) -> Callable[[Frame[Any], Points], None]:
         def publish(frame: Frame[Any], points: Points) -> None:
             points = self.filter.points(points)
-            rgb = _colors(frame.items["color"], points.shape) if "color" in frame.items else None
+            rgb = _colors(frame.items["color"], frame.items["info"], points.shape) if "color" in frame.items else None
             self._points[name].publish(cloud_from_points(points, frame.frame_id, frame.t_ns, rgb))
 
         return publish

@@ -27,8 +27,8 @@ from openarm_common.resources import config_dir
 from openarm_common.robot.posture import JointNeed, Posture
 from openarm_common.ros.answers import answering
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
-from openarm_common.ros.convert import array_to_image, depth_image, intrinsics_from_info, rgb_image
 from openarm_common.ros.detections import detections_to_msg
+from openarm_common.ros.images import array_to_image, color_of, depth_of, lens_from_info
 from openarm_common.ros.labelled_clouds import labelled_cloud_to_msg
 from openarm_common.ros.node import QOS_LATCHED, QOS_SENSOR, BaseNode, reliable, run
 from openarm_common.ros.tf import RobotStateListener
@@ -164,7 +164,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
     def _take_calibrated(self, info: CameraInfo) -> None:
         """Compare with these intrinsics from now on; none: those of the calibration are not known."""
         try:
-            self._watch.calibrated = intrinsics_from_info(info) if info.width else None
+            self._watch.calibrated = lens_from_info(info).intrinsics if info.width else None
         except OpenArmError as error:
             self.get_logger().warning(f"intrinsics of the calibration are ignored: {error.message}")
 
@@ -189,8 +189,12 @@ class DetectNode(BaseNode[DetectNodeConfig]):
     def _on_frame(self, frame: Frame[Any]) -> None:
         posture = frame.posture
         try:
-            rgb, intrinsics = rgb_image(frame.items["color"]), intrinsics_from_info(frame.items["info"])
-            depth = depth_image(frame.items["depth"]) if "depth" in frame.items else np.zeros(rgb.shape[:2], np.uint16)
+            items = frame.items
+            rgb, lens = color_of(items["color"], items["info"])
+            intrinsics = lens.intrinsics
+            depth = np.zeros(rgb.shape[:2], np.uint16)
+            if "depth" in items:
+                depth, _ = depth_of(items["depth"], items["info"])
             started = time.perf_counter()
             robot = self._find_robot(depth, intrinsics, posture)
             self._newest = View(rgb, depth, intrinsics, posture.T_base_frame, robot)

@@ -3,122 +3,252 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo
 
-from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.lens import Lens
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import depth_image, rgb_image, stamp_to_ns
-from openarm_perception.frames.images import Frame, rectified
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.images import AnyImage, depth_image, lens_from_info, rgb_image
+from openarm_common.types import Array
+from openarm_perception.frames.images import Frame, metres
+from openarm_perception.geometry.align import aligned
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
-_COLOR, _INFO = "/color/image_raw", "/color/camera_info"
-#: Depth that is aligned with the colour image, as RealSense drivers and this suite call it.
-_DEPTH = ("/aligned_depth_to_color/image_raw", "/depth/image_raw")
+IMAGE, COMPRESSED, INFO = (f"sensor_msgs/msg/{kind}" for kind in ("Image", "CompressedImage", "CameraInfo"))
+#: Ends of topics of colour and of depth, of drivers of RealSense, ZED, OAK, Kinect, Orbbec and of simulations; those
+#: that are rectified, or aligned with colour, first.
+_COLOR = (
+    "color/image_rect", "color/image_raw", "color/image_rect_raw", "rgb/image_rect_color", "rgb/image_rect",
+    "rgb/color/rect/image", "rgb/image_raw", "rgb/image_color", "rgb/image", "left/color/rect/image",
+    "left/image_rect_color", "left/image_rect", "image_rect_color", "image_raw", "image_color", "image",
+)  # fmt: skip
+_DEPTH = (
+    "aligned_depth_to_color/image_raw", "depth_to_rgb/image_raw", "depth_registered/image_raw",
+    "depth_registered/image_rect", "depth_registered/image", "depth/depth_registered", "stereo/image_raw",
+    "depth/image_rect", "depth/image_raw", "depth/image_rect_raw", "depth/image", "depth_image", "depth",
+)  # fmt: skip
+#: What image_transport adds to a topic.
+_TRANSPORTS = ("", "/compressed", "/compressedDepth")
+#: Ends of topics of image_proc, whose images are without distortion while their CameraInfo is that of the lens.
+_RECTIFIED = ("/image_rect", "/image_rect_color", "/rect/image")
 #: Colour and depth of one frame differ by no more, ns.
 _TOGETHER = 20_000_000
+#: Intrinsics of the same image differ by no more, px.
+_SAME_PX = 0.5
 
 
 class CameraTopics(NamedTuple):
-    """Topics of a depth camera."""
+    """Topics of a depth camera; `depth_info` is empty where the depth has no CameraInfo of its own."""
 
     color: str
     depth: str
     info: str
+    depth_info: str = ""
 
 
-def camera_topics(names: Collection[str], camera: str = "") -> CameraTopics:
+def camera_topics(
+    kinds: Mapping[str, str], camera: str = "", *, color: str = "", depth: str = "", info: str = ""
+) -> CameraTopics:
     """Choose the topics of a camera among those that there are.
 
     Args:
-        names: Of topics.
+        kinds: Type by topic.
         camera: Namespace, such as `/camera/camera`, or a part of one; "": the only camera.
+        color: Topic of the colour image; "": by the names that drivers use.
+        depth: Topic of the depth image, likewise.
+        info: Topic of the CameraInfo of the colour image, likewise.
 
     Raises:
-        OpenArmError: NOTHING_DETECTED, when there is no such camera; INVALID_ARGUMENT, when there are several.
+        OpenArmError: NOTHING_DETECTED, when there is no such camera; INVALID_ARGUMENT, when there are several, or a
+            topic is missing or of another type.
     """
-    found: dict[str, CameraTopics] = {}
-    for name in sorted(names):
-        space = name.removesuffix(_COLOR)
-        depth = next((space + end for end in _DEPTH if space + end in names), "")
-        if name.endswith(_COLOR) and depth and space + _INFO in names:
-            found[space] = CameraTopics(name, depth, space + _INFO)
-    wanted = f"/{camera.strip('/')}"
-    chosen = [wanted] if wanted in found else [space for space in found if camera.strip("/") in space]
-    listed = ", ".join(found) or "none"
-    if not chosen:
+    for option, topic, types in (
+        ("--color", color, (IMAGE, COMPRESSED)), ("--depth", depth, (IMAGE, COMPRESSED)), ("--info", info, (INFO,)),
+    ):  # fmt: skip
+        if topic and kinds.get(topic) not in types:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"{option} {topic} is no topic with {' or '.join(types)}; {_listed(kinds)}"
+            )
+    if color and depth:
+        return _with_infos(CameraTopics(color, depth, info), kinds)
+    cameras = {
+        space: _with_infos(CameraTopics(color or its_color, depth or its_depth, info), kinds, fail=False)
+        for space in sorted({space for end in (*_COLOR, *_DEPTH) for space in _spaces(kinds, end)})
+        if (its_color := color or _first(kinds, space, _COLOR)) and (its_depth := depth or _first(kinds, space, _DEPTH))
+    }
+    cameras = {space: topics for space, topics in cameras.items() if topics.info}
+    part = camera.strip("/")
+    chosen = [f"/{part}"] if f"/{part}" in cameras else [space for space in cameras if part in space]
+    if len({cameras[space] for space in chosen}) == 1:
+        return cameras[chosen[0]]
+    if chosen:
         raise OpenArmError(
-            Code.NOTHING_DETECTED,
-            f"no depth camera {camera or 'at all'!r}: expected topics that end in {_COLOR}, {_INFO} and {_DEPTH[0]} (or"
-            f" {_DEPTH[1]}); cameras: {listed}",
+            Code.INVALID_ARGUMENT, f"several cameras: {', '.join(chosen)}; choose one by --camera, or topics by --color"
         )
-    if len(chosen) > 1:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"several cameras: {', '.join(chosen)}; choose one with --camera")
-    return found[chosen[0]]
+    what = f"no depth camera {camera!r}" if camera else "no depth camera"
+    raise OpenArmError(
+        Code.NOTHING_DETECTED,
+        f"{what} with the names that drivers use; cameras: {', '.join(cameras) or 'none'}; choose topics by --color,"
+        f" --depth and --info; {_listed(kinds)}",
+    )
+
+
+def _listed(kinds: Mapping[str, str]) -> str:
+    images = [topic for topic, kind in sorted(kinds.items()) if kind in (IMAGE, COMPRESSED)]
+    infos = [topic for topic, kind in sorted(kinds.items()) if kind == INFO]
+    return f"image topics: {', '.join(images) or 'none'}; camera_info topics: {', '.join(infos) or 'none'}"
+
+
+def _spaces(kinds: Mapping[str, str], end: str) -> list[str]:
+    ends = [f"/{end}{transport}" for transport in _TRANSPORTS]
+    return [topic.removesuffix(one) for one in ends for topic in kinds if topic.endswith(one)]
+
+
+def _first(kinds: Mapping[str, str], space: str, ends: tuple[str, ...]) -> str:
+    """Return the first topic of a namespace that has images; "" without."""
+    names = (f"{space}/{end}{transport}" for end in ends for transport in _TRANSPORTS)
+    return next((name for name in names if kinds.get(name) in (IMAGE, COMPRESSED)), "")
+
+
+def _with_infos(topics: CameraTopics, kinds: Mapping[str, str], *, fail: bool = True) -> CameraTopics:
+    """Return topics with the CameraInfo next to each image.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED, when the colour image has none.
+    """
+
+    def of(image: str) -> str:
+        name = _untransported(image).rpartition("/")[0] + "/camera_info"
+        return name if kinds.get(name) == INFO else ""
+
+    info = topics.info or of(topics.color)
+    if not info and fail:
+        raise OpenArmError(
+            Code.NOTHING_DETECTED, f"no camera_info next to {topics.color}; give its topic by --info; {_listed(kinds)}"
+        )
+    own = of(topics.depth)
+    return topics._replace(info=info, depth_info="" if own == info else own)
+
+
+def _untransported(topic: str) -> str:
+    return topic.removesuffix("/compressed").removesuffix("/compressedDepth")
 
 
 class FrameBuilder:
     """Puts the messages of a camera together: colour and depth of the same time, and the newest intrinsics.
 
     Args:
-        topics: Of the camera.
+        topics: Topics of the camera.
         limits: Depths that count.
-        depth_scale: Metres of a count of a depth image of integers; 0.001 is that of ROS.
+        depth_scale: Metres of a count of depth; None is that of ROS: 0.001 of integers, 1 of floats.
+        pose: Returns the pose (4, 4) of the second frame in the first one; None, when it is not known.
     """
 
-    def __init__(self, topics: CameraTopics, limits: DepthLimits, depth_scale: float = 0.001) -> None:
-        self._topics, self._limits, self._scale = topics, limits, depth_scale
+    def __init__(
+        self,
+        topics: CameraTopics,
+        limits: DepthLimits,
+        depth_scale: float | None = None,
+        pose: Callable[[str, str], Array | None] = lambda _target, _source: None,
+    ) -> None:
+        self._topics, self._limits, self._scale, self._pose = topics, limits, depth_scale, pose
         self._newest: dict[str, Any] = {}
 
-    def take(self, topic: str, message: Image | CameraInfo) -> Frame | None:
+    def take(self, topic: str, message: AnyImage | CameraInfo) -> Frame | None:
         """Take a message; returns a frame when it completes one.
 
         Raises:
             OpenArmError: BAD_IMAGE, when colour, depth and camera_info do not belong together or cannot be read.
         """
         self._newest[topic] = message
-        color, depth = self._newest.get(self._topics.color), self._newest.get(self._topics.depth)
-        info = self._newest.get(self._topics.info)
-        if color is None or depth is None or info is None:
+        names = self._topics
+        color, depth = self._newest.get(names.color), self._newest.get(names.depth)
+        if color is None or depth is None or any(name not in self._newest for name in self._wanted()):
             return None
         if abs(stamp_to_ns(color.header.stamp) - stamp_to_ns(depth.header.stamp)) > _TOGETHER:
             return None
-        return frame_of(color, depth, info, self._limits, self._scale)
+        return self._frame(color, depth)
+
+    def _wanted(self) -> list[str]:
+        return [topic for topic in self._topics if topic]
 
     def missing(self) -> str:
         """What has not come, for an error."""
-        absent = [topic for topic in self._topics if topic not in self._newest]
+        absent = [topic for topic in self._wanted() if topic not in self._newest]
         return f"nothing on {', '.join(absent)}" if absent else "no colour and depth image of the same time"
 
+    def _frame(self, color: AnyImage, depth: AnyImage) -> Frame:
+        """Make a frame: without distortion, and with the depth where the colour camera sees it."""
+        lens = self._lens(self._topics.color, self._topics.info)
+        rgb = lens.rectified(_fitting("colour", rgb_image(color), lens))
+        counts = depth_image(depth)
+        z = metres(counts, self._scale)
+        own = self._topics.depth_info
+        if own:
+            of_depth = self._lens(self._topics.depth, own)
+            T_color_depth = self._between(color, depth)
+            z = of_depth.rectified_depth(_fitting("depth", z, of_depth))
+            if T_color_depth is not None or not _alike(lens, of_depth):
+                pose = np.eye(4) if T_color_depth is None else T_color_depth
+                z = aligned(z, of_depth.intrinsics, pose, lens.intrinsics)
+        else:
+            if _frame_id(depth) != _frame_id(color):
+                raise OpenArmError(
+                    Code.BAD_IMAGE,
+                    f"{self._topics.depth} is in frame {_frame_id(depth)!r}, {self._topics.color} in"
+                    f" {_frame_id(color)!r}, and the depth has no camera_info; {_ALIGN}",
+                )
+            z = lens.rectified_depth(_fitting("depth", z, lens))
+        points = Deprojector(self._limits).organised(z, lens.intrinsics)
+        return Frame(points, np.ascontiguousarray(rgb), lens.intrinsics)
 
-def frame_of(color: Image, depth: Image, info: CameraInfo, limits: DepthLimits, depth_scale: float = 0.001) -> Frame:
-    """Make a frame of aligned images; distortion is removed.
+    def _lens(self, image: str, info: str) -> Lens:
+        return lens_from_info(self._newest[info], rectified=_untransported(image).endswith(_RECTIFIED))
 
-    Args:
-        color: 8 bits, rgb8 or bgr8.
-        depth: 16UC1 counts, or 32FC1 metres.
-        info: Of both.
-        limits: Depths that count.
-        depth_scale: Metres of a count.
+    def _between(self, color: AnyImage, depth: AnyImage) -> Array | None:
+        """Return the pose of the depth's frame in that of colour; None where they are one."""
+        target, source = _frame_id(color), _frame_id(depth)
+        if target == source or not (target and source):
+            return None
+        pose = self._pose(target, source)
+        if pose is None:
+            raise OpenArmError(
+                Code.NO_TRANSFORM,
+                f"{self._topics.depth} is in frame {source!r}, {self._topics.color} in {target!r}, and /tf_static does"
+                f" not tie them; {_ALIGN}, or record /tf_static, too",
+            )
+        return None if np.allclose(pose, np.eye(4), atol=1e-6) else pose
+
+
+_ALIGN = "take depth that the driver aligns with colour (RealSense: align_depth.enable:=true) by --depth"
+
+
+def _frame_id(message: Any) -> str:
+    return message.header.frame_id.lstrip("/")
+
+
+def _alike(a: Lens, b: Lens) -> bool:
+    one, other = a.intrinsics, b.intrinsics
+    return (one.width, one.height) == (other.width, other.height) and all(
+        abs(getattr(one, name) - getattr(other, name)) < _SAME_PX for name in ("fx", "fy", "cx", "cy")
+    )
+
+
+def _fitting(what: str, picture: Any, lens: Lens) -> Any:
+    """Return an image, which must have the size of its CameraInfo.
 
     Raises:
-        OpenArmError: BAD_IMAGE, when they do not belong together or cannot be read.
+        OpenArmError: BAD_IMAGE.
     """
-    k = info.k
-    lens = Intrinsics(info.width, info.height, k[0], k[4], k[2], k[5])
-    if fault := lens.fault():
-        raise OpenArmError(Code.BAD_IMAGE, f"camera_info of {info.header.frame_id!r} is not calibrated: {fault}")
-    rgb, counts = rgb_image(color), depth_image(depth)
-    for name, shape in (("colour", rgb.shape), ("depth", counts.shape)):
-        if shape[:2] != (lens.height, lens.width):
-            text = (
-                f"the {name} image is {shape[1]}x{shape[0]} pixels, expected {lens.width}x{lens.height} of camera_info"
-            )
-            raise OpenArmError(Code.BAD_IMAGE, text)
-    z = counts.astype(np.float32) * np.float32(depth_scale if counts.dtype == np.uint16 else 1.0)
-    if any(value != 0.0 for value in info.d):
-        rgb, z = rectified(rgb, z, lens, np.asarray(info.d, dtype=np.float64), info.distortion_model)
-    return Frame(Deprojector(limits).organised(z, lens), np.ascontiguousarray(rgb), lens)
+    k = lens.intrinsics
+    if picture.shape[:2] != (k.height, k.width):
+        raise OpenArmError(
+            Code.BAD_IMAGE,
+            f"the {what} image is {picture.shape[1]}x{picture.shape[0]} pixels, expected {k.width}x{k.height} of its"
+            " camera_info",
+        )
+    return picture

@@ -20,7 +20,8 @@ from openarm_common.camera.cameras import CameraConfig, depth_camera, load_camer
 from openarm_common.camera.depth_view import millimetres
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
-from openarm_common.ros.convert import array_to_image, info_from_intrinsics, rgb_image, stamp_to_ns
+from openarm_common.ros.convert import info_from_intrinsics, stamp_to_ns
+from openarm_common.ros.images import array_to_image, rgb_image
 from openarm_common.ros.node import QOS_NEWEST, QOS_SENSOR, BaseNode, run
 from openarm_common.types import Floats
 from openarm_perception.config import StereoNodeConfig

@@ -16,8 +16,9 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Image
 
 from openarm_common.camera.cameras import CameraConfig, Intrinsics
-from openarm_common.ros.convert import ENCODINGS, array_to_image, image_to_array, info_from_intrinsics, ns_to_stamp
+from openarm_common.ros.convert import info_from_intrinsics, ns_to_stamp
 from openarm_common.ros.image_rates import WantedRates
+from openarm_common.ros.images import LAYOUTS, array_to_image, image_to_array
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_sim_bridge.cameras.cameras import SimulatedCameras
 from openarm_sim_bridge.cameras.handover import CameraSetup
@@ -37,7 +38,7 @@ class _Stream:
     """One image topic with its info; the pixels are written into the message."""
 
     def __init__(self, node: Node, setup: CameraSetup, camera: CameraConfig, stream: str, encoding: str) -> None:
-        dtype, channels = ENCODINGS[encoding]
+        dtype, channels = LAYOUTS[encoding]
         shape = (camera.height, camera.width, channels) if channels > 1 else (camera.height, camera.width)
         topics = (setup.topics[f"/{camera.name}/{stream}/{kind}"] for kind in _KINDS)
         self.image, self.info = (

@@ -53,7 +53,7 @@ class StandIns:
         from openarm_common.octree.codec import encode_states
         from openarm_common.octree.lattice import Lattice
         from openarm_common.robot.description import RobotDescription
-        from openarm_common.ros.convert import array_to_image
+        from openarm_common.ros.images import array_to_image
         from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 
         self.picks: list[Any] = []

@@ -12,7 +12,8 @@ from vision_msgs.msg import Detection3DArray
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, stamp_to_ns
+from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform, stamp_to_ns
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, reliable
 from openarm_perception.ros.detector_node import DetectNode
 

@@ -17,7 +17,8 @@ from openarm_common.octree.codec import decode
 from openarm_common.octree.distance_field import field_path
 from openarm_common.octree.lattice import Lattice
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, ns_to_stamp
+from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform, ns_to_stamp
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF
 from openarm_octomap.ros.node import OctomapNode
 

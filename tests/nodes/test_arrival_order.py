@@ -10,7 +10,8 @@ import pytest
 from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Empty
 
-from openarm_common.ros.convert import array_to_image, ns_to_stamp, stamp_to_ns
+from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_perception.ros.cloud_node import CloudNode
 from tests.nodes.octomap_bench import FRAME, JOINTS, ROBOT, Bench, sheet

@@ -26,13 +26,8 @@ from openarm_calibration.ros.publisher import PublisherNode
 from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.config import Config
-from openarm_common.ros.convert import (
-    image_to_array,
-    intrinsics_from_info,
-    pose_to_matrix,
-    stamp_to_ns,
-    transform_to_matrix,
-)
+from openarm_common.ros.convert import pose_to_matrix, stamp_to_ns, transform_to_matrix
+from openarm_common.ros.images import image_to_array, lens_from_info
 from openarm_common.ros.node import QOS_COMMAND, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, BaseNode, reliable
 from openarm_sim_bridge.cameras import camera_feed
 
@@ -84,7 +79,7 @@ def test_images_info_and_joint_states_belong_together(seeing) -> None:
     # The table top, seen by a camera whose mount is nominal: planar depth of a plane.
     T = load_cameras()["overhead"].T_parent_optical
     v, u = np.array([430, 430, 460]), np.array([320, 100, 550])
-    rays = intrinsics_from_info(info)
+    rays = lens_from_info(info).intrinsics
     points = rays.deproject(np.stack([u, v], axis=-1), z[v, u].astype(float))
     heights = (points @ T[:3, :3].T + T[:3, 3])[:, 2]
     np.testing.assert_allclose(heights, 0.40, atol=1e-3)
@@ -119,7 +114,7 @@ def test_a_cube_is_seen_by_the_wrist_camera_where_camera_info_and_tf_say(seeing)
     half = 0.5 * np.array([cube.size.x, cube.size.y, cube.size.z])
     corners = half * np.array(list(itertools.product((-1, 1), repeat=3)))
     in_camera = se3.apply(se3.inverse(T) @ pose_to_matrix(cube.pose), corners)
-    outline = cv2.convexHull(intrinsics_from_info(infos[-1]).project(in_camera).astype(np.float32))
+    outline = cv2.convexHull(lens_from_info(infos[-1]).intrinsics.project(in_camera).astype(np.float32))
     moments = cv2.moments(outline)
     centre = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
 

@@ -26,7 +26,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.convert import image_to_array, stamp_to_ns, transform_to_matrix, xyz
+from openarm_common.ros.convert import stamp_to_ns, transform_to_matrix, xyz
+from openarm_common.ros.images import image_to_array
 from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
 from openarm_common.scene.scene import load_scene
 from openarm_control.ros.robot_publisher import JOINT_STATE_DEADLINE

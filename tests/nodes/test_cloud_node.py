@@ -9,7 +9,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from openarm_common.camera.cameras import load_cameras
-from openarm_common.ros.convert import array_to_image, info_from_intrinsics, points_from_cloud, stamp_to_ns
+from openarm_common.ros.convert import info_from_intrinsics, points_from_cloud, stamp_to_ns
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_perception.ros.cloud_node import CloudNode
 from tests.refusals import refused

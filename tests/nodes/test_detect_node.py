@@ -16,14 +16,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.convert import (
-    array_to_image,
-    image_to_array,
-    info_from_intrinsics,
-    ns_to_stamp,
-    pose_to_matrix,
-    stamp_to_ns,
-)
+from openarm_common.ros.convert import info_from_intrinsics, ns_to_stamp, pose_to_matrix, stamp_to_ns
+from openarm_common.ros.images import array_to_image, image_to_array
 from openarm_common.ros.node import QOS_LATCHED, QOS_SENSOR
 from openarm_perception.ros import detector_node
 from openarm_perception.ros.detector_node import DetectNode

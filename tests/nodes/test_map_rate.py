@@ -8,7 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from openarm_common.ros.convert import array_to_image, stamp_to_ns
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.images import array_to_image
 from tests.nodes.octomap_bench import FRAME, Bench, sheet
 
 PERIOD, FRAME_PERIOD = 0.5, 1.0 / 30.0

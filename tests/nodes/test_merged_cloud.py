@@ -12,13 +12,13 @@ from benchmarks.map_scene import MapScene
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import (
-    array_to_image,
     info_from_intrinsics,
     matrix_to_transform,
     ns_to_stamp,
     points_from_cloud,
     stamp_to_ns,
 )
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 from openarm_common.scene.scene import load_scene
 from openarm_perception.geometry.merge import CloudMerger

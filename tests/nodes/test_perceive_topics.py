@@ -3,23 +3,27 @@
 
 from __future__ import annotations
 
+import array
 from threading import Thread
 
 import cv2
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from tf2_msgs.msg import TFMessage
 
 from openarm_bringup.bags.bag import BagWriter
 from openarm_bringup.bags.ros.listener import from_profile
 from openarm_bringup.commands.perceive import perceive
+from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code
-from openarm_common.ros.convert import array_to_image, info_from_intrinsics
+from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform
+from openarm_common.ros.images import array_to_image, image_to_array
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_perception.geometry.depth import DepthLimits
-from openarm_perception.ros.frames import FrameBuilder, camera_topics, frame_of
+from openarm_perception.ros.frames import COMPRESSED, IMAGE, INFO, FrameBuilder, camera_topics
 from tests.refusals import refused
 
 pytestmark = pytest.mark.requirement("R-19")
@@ -46,10 +50,18 @@ def messages(t_ns: int, scale: float = 0.001) -> tuple[Image, Image, CameraInfo]
     )
 
 
-def check(data: dict[str, object]) -> None:
+KINDS = dict(zip(TOPICS, (IMAGE, IMAGE, INFO), strict=True))
+
+
+def frame_of(color, depth, info, limits: DepthLimits, scale: float | None = None):
+    builder = FrameBuilder(camera_topics(KINDS), limits, scale)
+    return [builder.take(topic, message) for topic, message in zip(TOPICS, (color, depth, info), strict=True)][-1]
+
+
+def check(data: dict[str, object], off: float = 0.005) -> None:
     (one,) = data["clusters"]  # type: ignore[misc]
     assert (one["shape"], one["color"]) == ("box", "red")
-    assert one["size"] == pytest.approx([0.06, 0.08, 0.05], abs=0.005)  # a pixel
+    assert one["size"] == pytest.approx([0.06, 0.08, 0.05], abs=off)  # a pixel
 
 
 def test_the_topics_of_a_running_camera_are_perceived(ros, tmp_path):
@@ -75,7 +87,9 @@ def test_the_topics_of_a_running_camera_are_perceived(ros, tmp_path):
 
 
 def test_a_graph_without_a_camera_is_answered_with_what_is_expected(ros):
-    assert refused("aligned_depth_to_color", perceive, timeout=0.2).code is Code.NOTHING_DETECTED
+    error = refused("no depth camera with the names that drivers use; cameras: none", perceive, timeout=0.2)
+    assert error.code is Code.NOTHING_DETECTED
+    assert "choose topics by --color, --depth and --info; image topics: none" in error.message
 
 
 @pytest.fixture
@@ -98,40 +112,124 @@ def test_a_bag_gives_the_first_frame_whose_images_are_of_the_same_time(bag):
     check(perceive(next(bag.glob("*.mcap")), camera="camera/camera").data)
     refused(r"from 2\.5 s on: nothing on /camera/camera/aligned_depth", perceive, bag, start=2.5)
     refused(r"no depth camera 'wrist'.*cameras: /camera/camera", perceive, bag, camera="wrist")
+    refused(r"--depth /none is no topic with .*; image topics: /camera/camera/aligned", perceive, bag, depth="/none")
 
 
 def test_cameras_are_chosen_by_their_namespace():
-    two = [*TOPICS, *(f"/overhead/{end}" for end in ("color/image_raw", "color/camera_info", "depth/image_raw"))]
+    two = {**KINDS, "/overhead/color/image_raw": IMAGE, "/overhead/color/camera_info": INFO}
+    two["/overhead/depth/image_raw"] = IMAGE
     assert camera_topics(two, "overhead").depth == "/overhead/depth/image_raw"
-    assert camera_topics(two, "/camera/camera") == TOPICS
+    assert camera_topics(two, "/camera/camera")[:3] == TOPICS
     refused("several cameras: /camera/camera, /overhead", camera_topics, two)
+    chosen = camera_topics(two, "overhead", depth=TOPICS[1])
+    assert chosen[:2] == ("/overhead/color/image_raw", TOPICS[1])
 
 
-def test_counts_are_scaled_and_metres_are_not():
+@pytest.mark.parametrize(
+    ("color", "depth", "info", "others"),
+    [
+        ("/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw",
+         "/camera/camera/color/camera_info", ("/camera/camera/depth/image_rect_raw",)),
+        ("/camera/color/image_rect_raw", "/camera/aligned_depth_to_color/image_raw", "/camera/color/camera_info", ()),
+        ("/zed/zed_node/rgb/image_rect_color", "/zed/zed_node/depth/depth_registered",
+         "/zed/zed_node/rgb/camera_info", ("/zed/zed_node/rgb_raw/image_raw_color", "/zed/zed_node/left/image_rect")),
+        ("/zed/zed_node/rgb/color/rect/image", "/zed/zed_node/depth/depth_registered",
+         "/zed/zed_node/rgb/color/rect/camera_info", ("/zed/zed_node/left/color/rect/image",)),
+        ("/oak/rgb/image_raw", "/oak/stereo/image_raw", "/oak/rgb/camera_info", ("/oak/left/image_rect",)),
+        ("/rgb/image_raw", "/depth_to_rgb/image_raw", "/rgb/camera_info",
+         ("/depth/image_raw", "/rgb_to_depth/image_raw", "/ir/image_raw")),
+        ("/camera/rgb/image_rect_color", "/camera/depth_registered/image_raw", "/camera/rgb/camera_info",
+         ("/camera/depth/image", "/camera/rgb/image_color")),
+        ("/camera/color/image_raw/compressed", "/camera/depth/image_raw/compressedDepth", "/camera/color/camera_info",
+         ()),
+        ("/rgbd/image", "/rgbd/depth_image", "/rgbd/camera_info", ()),
+    ],
+)  # fmt: skip
+@pytest.mark.requirement("M-08")
+def test_the_topics_of_drivers_are_found_by_themselves(color, depth, info, others):
+    """Names of realsense2_camera, the D405, zed_wrapper 4 and 5, depthai, Azure Kinect, openni, image_transport, gz."""
+    kind = {name: COMPRESSED if "compressed" in name else IMAGE for name in (color, depth, *others)}
+    assert camera_topics({**kind, info: INFO})[:3] == (color, depth, info)
+
+
+@pytest.mark.parametrize("named", [False, True])
+@pytest.mark.requirement("M-08")
+def test_compressed_topics_of_any_name_are_perceived(tmp_path, named):
+    color, depth, info = messages(0)
+    rgb, z = image_to_array(color), image_to_array(depth)
+    jpeg = CompressedImage(header=color.header, format="rgb8; jpeg compressed bgr8")
+    jpeg.data = array.array("B", cv2.imencode(".jpg", rgb[..., ::-1])[1].tobytes())
+    png = CompressedImage(header=depth.header, format="16UC1; compressedDepth png")
+    png.data = array.array("B", bytes(12) + cv2.imencode(".png", z)[1].tobytes())
+    space = "/top" if named else "/cam/color/image_raw"
+    topics = (f"{space}/compressed", "/deep" if named else "/cam/depth/image_raw/compressedDepth",
+              "/lens" if named else "/cam/color/camera_info")  # fmt: skip
+    write(tmp_path / "bag", dict(zip(topics, (jpeg, png, info), strict=True)))
+    options = dict(zip(("color", "depth", "info"), topics, strict=True)) if named else {}
+    check(perceive(tmp_path / "bag", **options).data)
+    if named:
+        refused(r"image topics: /deep, /top/compressed; camera_info topics: /lens", perceive, tmp_path / "bag")
+
+
+def write(path, by_topic) -> None:
+    with BagWriter(path, {}) as writer:
+        for topic, message in by_topic.items():
+            kind = f"{type(message).__module__.split('.')[0]}/msg/{type(message).__name__}"
+            writer.add_topic(topic, kind, from_profile(QOS_SENSOR))
+            writer.write(topic, 0, serialize_message(message))
+
+
+@pytest.mark.parametrize("away", [None, (0.05, -0.02, 0.0)])
+@pytest.mark.requirement("M-02")
+def test_depth_of_another_camera_is_aligned_or_refused(tmp_path, away):
+    """The depth camera has other intrinsics, and stands beside the colour camera; the box is where colour sees it."""
+    of_depth = Intrinsics(200, 140, 150.0, 150.0, 95.0, 72.0)
+    x0, y0, _ = away or (0.0, 0.0, 0.0)
+    v, u = np.mgrid[:140, :200]
+    top = DISTANCE - HEIGHT
+    x, y = (u - of_depth.cx) / of_depth.fx * top + x0, (v - of_depth.cy) / of_depth.fy * top + y0
+    z = np.where((np.abs(x) < HALF[0]) & (np.abs(y) < HALF[1]), top, DISTANCE)
+    color, _, info = messages(0)
+    frame = "camera_depth_optical_frame" if away else color.header.frame_id
+    depth = array_to_image(np.round(z * 1000).astype(np.uint16), "16UC1", frame, 0)
+    by_topic = {
+        "/camera/color/image_raw": color, "/camera/color/camera_info": info, "/camera/depth/image_rect_raw": depth,
+        "/camera/depth/camera_info": info_from_intrinsics(of_depth, frame, 0),
+    }  # fmt: skip
+    if away:
+        write(tmp_path / "untied", by_topic)
+        refused("and /tf_static does not tie them; take depth that the driver aligns", perceive, tmp_path / "untied")
+        edges = TFMessage(transforms=[
+            matrix_to_transform("camera_link", color.header.frame_id, np.eye(4), 0),
+            matrix_to_transform("camera_link", frame, se3.make(None, away), 0),
+        ])  # fmt: skip
+        by_topic = {"/tf_static": edges, **by_topic}
+    write(tmp_path / "bag", by_topic)
+    data = perceive(tmp_path / "bag").data
+    check(data, 0.01 if away else 0.005)  # the box hides a strip from the other camera
+    (one,) = data["clusters"]
+    assert one["centre"][:2] == pytest.approx([0.0, 0.0], abs=0.004)
+
+
+@pytest.mark.requirement("M-02")
+def test_depth_in_another_frame_without_intrinsics_is_refused(tmp_path):
+    color, depth, info = messages(0)
+    depth.header.frame_id = "camera_depth_optical_frame"
+    write(tmp_path / "bag", {"/c/color/image_raw": color, "/c/color/camera_info": info, "/c/depth": depth})
+    refused("the depth has no camera_info; take depth that the driver aligns", perceive, tmp_path / "bag")
+
+
+def test_every_encoding_is_scaled_as_said():
     color, depth, info = messages(0, scale=0.0001)
     near = frame_of(color, depth, info, DepthLimits(), 0.0001)
     assert np.nanmax(near.points[..., 2]) == pytest.approx(DISTANCE, abs=1e-4)
-    metres = array_to_image(np.nan_to_num(near.points[..., 2]), "32FC1", "c", 0)
-    again = frame_of(color, metres, info, DepthLimits(), 0.0001)
+    frame = color.header.frame_id
+    metres = array_to_image(np.nan_to_num(near.points[..., 2]), "32FC1", frame, 0)
+    again = frame_of(color, metres, info, DepthLimits())
     np.testing.assert_allclose(again.points[..., 2], near.points[..., 2])
-
-
-def test_the_distortion_of_a_lens_is_removed():
-    color, depth, info = messages(0)
-    d = np.array([-0.05, 0.06, 0.0005, -0.0003, -0.02])
-    matrix = np.array([[LENS.fx, 0.0, LENS.cx], [0.0, LENS.fy, LENS.cy], [0.0, 0.0, 1.0]])
-    v, u = np.mgrid[:120, :160].astype(np.float32)
-    # what a lens with distortion shows at a pixel is what a pinhole shows elsewhere
-    ideal = cv2.undistortPoints(np.stack([u, v], axis=-1).reshape(-1, 1, 2), matrix, d, P=matrix).reshape(120, 160, 2)
-    z = np.frombuffer(depth.data, np.uint16).reshape(120, 160)
-    bent = cv2.remap(z, ideal[..., 0], ideal[..., 1], cv2.INTER_NEAREST)
-    info.d, info.distortion_model = d.tolist(), "plumb_bob"
-    points = frame_of(color, array_to_image(bent, "16UC1", "c", 0), info, DepthLimits()).points
-    straight = frame_of(*messages(0), DepthLimits()).points
-    wrong = np.isfinite(points[..., 2]) & (np.abs(points[..., 2] - straight[..., 2]) > 0.01)
-    assert np.count_nonzero(wrong) < 40  # at the outline of the box, a pixel wide
-    info.distortion_model = "equidistant"
-    refused("'equidistant' with 5 coefficients; expected plumb_bob", frame_of, color, depth, info, DepthLimits())
+    in_mm = array_to_image(np.nan_to_num(near.points[..., 2]) * np.float32(1000), "32FC1", frame, 0)
+    again = frame_of(color, in_mm, info, DepthLimits(), 0.001)
+    np.testing.assert_allclose(again.points[..., 2], near.points[..., 2], rtol=1e-5)
 
 
 def test_what_does_not_belong_together_is_refused():
@@ -140,13 +238,13 @@ def test_what_does_not_belong_together_is_refused():
     refused("160x120 pixels, expected 320x120", frame_of, color, depth, info, DepthLimits())
     info.k = np.zeros(9)
     refused("is not calibrated", frame_of, color, depth, info, DepthLimits())
-    builder = FrameBuilder(camera_topics(TOPICS), DepthLimits())
+    builder = FrameBuilder(camera_topics(KINDS), DepthLimits())
     assert builder.take(TOPICS[0], color) is None
     assert builder.missing() == f"nothing on {TOPICS[1]}, {TOPICS[2]}"
 
 
 def test_colour_and_depth_of_different_times_make_no_frame():
-    topics = camera_topics(TOPICS)
+    topics = camera_topics(KINDS)
     (color, _, info), (_, late, _), (_, near, _) = messages(0), messages(100_000_000), messages(10_000_000)
     builder = FrameBuilder(topics, DepthLimits())
     for topic, message in ((topics.color, color), (topics.info, info), (topics.depth, late)):

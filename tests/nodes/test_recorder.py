@@ -19,7 +19,7 @@ from openarm_bringup.bags.ros.player import Player
 from openarm_bringup.bags.ros.recorder import Recorder
 from openarm_bringup.commands.record import replay
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import array_to_image
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 
 

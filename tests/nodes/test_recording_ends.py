@@ -31,7 +31,7 @@ from openarm_bringup.supervision.environment import PROFILE, write_profile
 from openarm_bringup.supervision.graph import NodeSpec
 from openarm_bringup.supervision.shm import SHM, names_of
 from openarm_common.errors import Code
-from openarm_common.ros.convert import array_to_image
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND
 from tests.conftest import DEADLINE_S
 from tests.nodes import streams

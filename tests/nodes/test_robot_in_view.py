@@ -15,14 +15,13 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import (
-    array_to_image,
-    image_to_array,
     info_from_intrinsics,
     matrix_to_pose,
     matrix_to_transform,
     ns_to_stamp,
     points_from_cloud,
 )
+from openarm_common.ros.images import array_to_image, image_to_array
 from openarm_common.ros.labelled_clouds import labelled_cloud_from_msg
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, reliable
 from openarm_perception.ros.cloud_node import CloudNode

@@ -12,14 +12,8 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.folder import ROBOT
-from openarm_common.ros.convert import (
-    array_to_image,
-    depth_image,
-    info_from_intrinsics,
-    intrinsics_from_info,
-    points_from_cloud,
-    stamp_to_ns,
-)
+from openarm_common.ros.convert import info_from_intrinsics, points_from_cloud, stamp_to_ns
+from openarm_common.ros.images import array_to_image, depth_image, lens_from_info
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_perception.ros.cloud_node import CloudNode
 from openarm_perception.ros.stereo_node import StereoNode
@@ -93,7 +87,7 @@ def test_depth_of_a_pair_is_what_the_cloud_node_takes(ros) -> None:
     depth = depth_image(depths[0])
     assert (depths[0].encoding, depths[0].header.frame_id) == ("16UC1", bench.left.optical_frame)
     assert stamp_to_ns(depths[0].header.stamp) % 250_000_000 == 0
-    k = intrinsics_from_info(infos[0])
+    k = lens_from_info(infos[0]).intrinsics
     own = bench.left.intrinsics
     assert (k.width, k.height, k.fx, k.cx) == pytest.approx((own.width, own.height, own.fx, own.cx))
     assert np.median(depth[:, SHIFT + 10 :]) == pytest.approx(1e3 * bench.depth_of_wall, abs=6.0)

@@ -26,7 +26,8 @@ from openarm_bringup.view.server import Confirmation, Order, Reset
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
-from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform
+from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF
 
 

@@ -21,7 +21,8 @@ from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
-from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, ns_to_stamp
+from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform, ns_to_stamp
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 from tests.openarm_bringup.commands import answer_of, calibrate, calibrate_fails
 from tests.openarm_calibration.known_session import BOARD, Known, make_session, photograph

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import yaml
 
-from openarm_calibration.foreign.optics import read_camera_info
 from openarm_calibration.store.store import CalibrationStore, StoredCalibration
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
+from openarm_common.camera.lens_files import read_lens
 from openarm_common.robot.description import RobotDescription
 from tests.openarm_bringup.commands import calibrate, calibrate_fails
 
@@ -74,7 +74,7 @@ def test_the_snippet_in_a_urdf_places_the_camera(capsys, store, tmp_path: Path, 
 @pytest.mark.requirement("P-28")
 def test_camera_info_has_all_fields_and_the_intrinsics(capsys, store, tmp_path: Path) -> None:
     text = written(capsys, tmp_path / "wrist.yaml", "--format", "camera_info")
-    lens = read_camera_info(tmp_path / "wrist.yaml")
+    lens = read_lens(tmp_path / "wrist.yaml")
     assert lens.intrinsics == K
     assert lens.straight
     data = yaml.safe_load(text)

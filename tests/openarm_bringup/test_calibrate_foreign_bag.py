@@ -22,7 +22,8 @@ from openarm_calibration.foreign.pose_robot import joints_of_pose, robot_of_pose
 from openarm_calibration.handeye.refine import mount_error
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
-from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, ns_to_stamp
+from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform, ns_to_stamp
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 from tests.openarm_bringup.commands import answer_of, calibrate_fails
 from tests.openarm_calibration import foreign_files as files

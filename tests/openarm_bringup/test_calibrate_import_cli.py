@@ -11,12 +11,13 @@ import pytest
 
 from openarm_bringup import cli
 from openarm_calibration.board.board import read_board
-from openarm_calibration.foreign.optics import Lens, camera_info
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
+from openarm_common.camera.lens import Lens
+from openarm_common.camera.lens_files import camera_info
 from openarm_common.robot.description import RobotDescription
 from tests.openarm_bringup.commands import answer_of, calibrate_fails
 from tests.openarm_calibration import foreign_files as files
@@ -165,7 +166,7 @@ HAND = ("--camera-kind", "eye_in_hand")
         ),
         (("poses.csv", *HAND, *IMAGES[:4], "--intrinsics", "1,2,3"), 2, "WIDTH,HEIGHT,FX,FY,CX,CY"),
         (("poses.csv", *HAND, *IMAGES[:4], "--intrinsics", "640,480,0,415,319,239"), 1, "fx=0"),
-        (("poses.csv", *HAND, *IMAGES[:4], "--intrinsics", "info.yaml"), 1, "is no camera_info"),
+        (("poses.csv", *HAND, *IMAGES[:4], "--intrinsics", "info.yaml"), 1, "has no intrinsics of a camera"),
         (
             ("poses.csv", *HAND, *IMAGES[:4], "--intrinsics", "1280,720,900,900,640,360"),
             1,

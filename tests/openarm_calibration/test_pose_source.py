@@ -16,11 +16,12 @@ from openarm_calibration.board.board import read_board
 from openarm_calibration.foreign.conventions import checked_form, read
 from openarm_calibration.foreign.explain import ROBOT_FRAMES, Poses
 from openarm_calibration.foreign.image_sets import Names, image_set
-from openarm_calibration.foreign.optics import Lens, read_camera_info
 from openarm_calibration.foreign.pose_source import Column, read_source
 from openarm_calibration.handeye.problem import project
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import solve
+from openarm_common.camera.lens import Lens
+from openarm_common.camera.lens_files import read_lens
 from openarm_common.errors import Code
 from tests.openarm_calibration import foreign_files as files
 from tests.refusals import refuses
@@ -356,14 +357,14 @@ def test_intrinsics_that_opencv_writes_are_read(tmp_path: Path, name: str) -> No
     file.write("camera_matrix", files.K.matrix)
     file.write("distortion_coefficients", np.array([[-0.2, 0.05, 0.001, 0.0, 0.01]]))
     file.release()
-    lens = read_camera_info(tmp_path / name)
+    lens = read_lens(tmp_path / name)
     assert np.array_equal(lens.intrinsics.matrix, files.K.matrix)
     assert (lens.model, lens.coefficients) == ("plumb_bob", (-0.2, 0.05, 0.001, 0.0, 0.01))
 
 
 def test_a_matrix_by_columns_is_told_by_its_zeros(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps({"camera": {"K": files.K.matrix.T.tolist(), "image_size": [640, 480]}}))
-    assert np.array_equal(read_camera_info(tmp_path / "a.json").intrinsics.matrix, files.K.matrix)
+    assert np.array_equal(read_lens(tmp_path / "a.json").intrinsics.matrix, files.K.matrix)
     (tmp_path / "b.json").write_text(json.dumps({"K": files.K.matrix.tolist()}))
     with refuses(Code.CONFIG_INVALID, "image_width"):
-        read_camera_info(tmp_path / "b.json")
+        read_lens(tmp_path / "b.json")

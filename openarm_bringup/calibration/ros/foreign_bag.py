@@ -5,32 +5,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_bringup.bags.bag import Bag
 from openarm_bringup.bags.ros.messages import contents, message_of, messages_of
 from openarm_bringup.calibration.foreign_options import Foreign, lens_given
 from openarm_bringup.calibration.ros.samples import stamp_of
 from openarm_calibration.board.board import Board
-from openarm_calibration.board.detect import detect
-from openarm_calibration.board.detection import BoardDetection
-from openarm_calibration.foreign.image_sets import grey_of
-from openarm_calibration.foreign.optics import Lens, lens_of
+from openarm_calibration.board.detect import detect_undistorted
 from openarm_calibration.foreign.pose_robot import joints_of_pose, robot_of_poses
 from openarm_calibration.foreign.pose_source import kind_of
-from openarm_calibration.ros.image_capture import grey
 from openarm_calibration.sampling.gate import GateConfig
 from openarm_calibration.sampling.samples import SampleSet, SessionHead
 from openarm_calibration.sampling.stills import Picker, State, Stretch, stretches
 from openarm_common import se3
+from openarm_common.camera.lens import Lens
 from openarm_common.config import read_text, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import stamp_to_ns, transform_to_matrix
-from openarm_common.types import Array
+from openarm_common.ros.images import grey_image, lens_from_info
+from openarm_common.types import Array, Bytes
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO, _JOINTS, _TF = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState", "tf2_msgs/msg/TFMessage"
@@ -75,18 +73,13 @@ def samples_of_foreign(bag: Bag, board: Board, given: Foreign) -> tuple[SampleSe
     with contents(bag):
         stamps = [stamp_of(record.data) for record in bag.records([images])]
     found = stretches(stamps, whole, names, robot, GateConfig())
-
-    def look(image: NDArray[np.uint8]) -> tuple[BoardDetection, NDArray[np.uint8]]:
-        seen = detect(board, image)
-        return BoardDetection(seen.ids, lens.undistorted(seen.pixels), seen.residual), lens.rectified(image)
-
-    picker = Picker(samples, found, look)
+    picker = Picker(samples, found, partial(detect_undistorted, board, lens=lens))
     for record in bag.records([images]):
         t_ns = stamp_of(record.data)
         if picker.wants(t_ns):
             message = message_of(bag, record)
             try:
-                pixels = _grey(message, lens, images, record.type == _COMPRESSED)
+                pixels = _grey(message, lens, images)
             except OpenArmError as error:
                 picker.refuse(t_ns, error)
             else:
@@ -94,12 +87,8 @@ def samples_of_foreign(bag: Bag, board: Board, given: Foreign) -> tuple[SampleSe
     return samples, found
 
 
-def _grey(message: Any, lens: Lens, topic: str, compressed: bool) -> NDArray[np.uint8]:
-    if compressed:
-        if "compressedDepth" in message.format:
-            raise OpenArmError(Code.BAD_IMAGE, f"{topic} has depth, expected images of grey or colour")
-        return grey_of(bytes(message.data), lens, topic)
-    pixels = grey(message)
+def _grey(message: Any, lens: Lens, topic: str) -> Bytes:
+    pixels = grey_image(message)
     if pixels.shape != (lens.intrinsics.height, lens.intrinsics.width):
         raise OpenArmError(
             Code.BAD_IMAGE,
@@ -138,7 +127,7 @@ def _lens(bag: Bag, images: str, given: Foreign) -> Lens:
     name = given.info_topic or next((t for t in near if bag.counts.get(t)), "")
     topic = _topic(bag, "info_topic", name, (_INFO,))
     info = messages_of(bag, (topic,))[topic][-1]
-    return lens_of((info.width, info.height), list(info.k), info.distortion_model, list(info.d), topic)
+    return lens_from_info(info)
 
 
 def _of_joints(bag: Bag, given: Foreign) -> tuple[RobotDescription, list[State]]:

@@ -5,21 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from openarm_bringup.bags.bag import Bag
 from openarm_bringup.bags.ros.messages import contents, message_of, messages_of
 from openarm_bringup.supervision.environment import name_of_zeros
 from openarm_calibration.board.board import Board
-from openarm_calibration.ros.image_capture import grey
+from openarm_calibration.board.detect import detect_undistorted
 from openarm_calibration.sampling.gate import GateConfig
 from openarm_calibration.sampling.samples import SampleSet, head_of
 from openarm_calibration.sampling.stills import Picker, Stretch, stretches
-from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
+from openarm_common.camera.cameras import CameraConfig, load_cameras
+from openarm_common.camera.lens import Lens
 from openarm_common.config import parse_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.convert import intrinsics_from_info, stamp_to_ns
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.images import grey_image, lens_from_info
 
 _IMAGES = "/color/image_raw"
 _INFOS = "/color/camera_info"
@@ -32,7 +35,7 @@ class _Small:
     robot: RobotDescription
     parents: dict[str, str]
     states: list[tuple[int, Mapping[str, float]]]
-    optics: dict[int, Intrinsics]
+    lenses: dict[int, Lens]
 
 
 def samples_of(
@@ -52,12 +55,12 @@ def samples_of(
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the bag lacks a topic or the camera; BAD_IMAGE, for a camera that is not
-            rectified; NO_TRANSFORM, when nothing says which link carries the camera.
+            calibrated; NO_TRANSFORM, when nothing says which link carries the camera.
     """
     camera = _camera(bag, camera)
     with contents(bag):
         small = _small(bag, camera)
-    optics = next(iter(small.optics.values()))
+    lens = next(iter(small.lenses.values()))
     configured = load_cameras()
     own = RobotDescription.load()
     base = own.base if own.base in small.robot.links else small.robot.root
@@ -65,7 +68,7 @@ def samples_of(
     simulated = camera not in configured or configured[camera].mount_error
     seed = mount_seed if mount_seed is not None else _seed(bag)
     head = head_of(
-        camera, parent, small.robot, optics, board, carrier,
+        camera, parent, small.robot, lens.intrinsics, board, carrier,
         base=base, mount_seed=seed if simulated else None, zeros_of=name_of_zeros(_bridge(bag)),
     )  # fmt: skip
     # a session file of a robot that this suite does not have keeps its description
@@ -77,11 +80,11 @@ def samples_of(
     with contents(bag):
         stamps = [stamp_of(record.data) for record in bag.records([images])]
     found = stretches(stamps, small.states, samples.joint_names, small.robot, GateConfig())
-    picker = Picker(samples, found)
+    picker = Picker(samples, found, partial(detect_undistorted, board, lens=lens))
     for record in bag.records([images]):
         t_ns = stamp_of(record.data)
         if picker.wants(t_ns):
-            picker.offer(t_ns, grey(message_of(bag, record)), small.optics.get(t_ns, optics))
+            picker.offer(t_ns, grey_image(message_of(bag, record)), small.lenses.get(t_ns, lens).intrinsics)
     return samples, found
 
 
@@ -122,7 +125,7 @@ def _small(bag: Bag, camera: str) -> _Small:
         robot=RobotDescription.from_urdf(urdf) if urdf else RobotDescription.load(),
         parents={e.child_frame_id: e.header.frame_id for message in found["/tf_static"] for e in message.transforms},
         states=sorted(states, key=lambda state: state[0]),
-        optics={stamp_to_ns(message.header.stamp): intrinsics_from_info(message) for message in found[info]},
+        lenses={stamp_to_ns(message.header.stamp): lens_from_info(message) for message in found[info]},
     )
 
 

@@ -34,16 +34,14 @@ from openarm_common.octree.codec import decode
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import (
-    depth_image,
     held_from_msg,
-    intrinsics_from_info,
     joints_from_msg,
     pose_to_matrix,
-    rgb_image,
     stamp_to_ns,
     transform_to_matrix,
     xyz,
 )
+from openarm_common.ros.images import color_of, depth_of, rgb_image
 from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF
 from openarm_common.ros.polled import Polled, Source
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
@@ -165,8 +163,8 @@ def _show_cloud(description: RobotDescription, camera: CameraConfig) -> Show:
         if depth is None or color is None or info is None or depth.header.stamp != color.header.stamp:
             return  # the other half of the frame comes soon
         T_base_optical = states.lookup(description.base, camera.optical_frame, stamp_to_ns(depth.header.stamp))
-        optics = intrinsics_from_info(info)
-        points, colors = wire.thin_cloud(deprojector, depth_image(depth), rgb_image(color), optics, T_base_optical)
+        pixels, lens = depth_of(depth, info)
+        points, colors = wire.thin_cloud(deprojector, pixels, color_of(color, info)[0], lens.intrinsics, T_base_optical)
         newest[0] = None  # shown
         yield "cloud", wire.frame({"kind": "cloud", "count": len(points)}, points, colors)
 

@@ -18,7 +18,8 @@ from sensor_msgs.msg import Image, JointState
 from openarm_bringup.ros.simulation import reset_world
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
-from openarm_common.ros.convert import rgb_image, stamp_to_ns, xyz
+from openarm_common.ros.convert import stamp_to_ns, xyz
+from openarm_common.ros.images import rgb_image
 from openarm_common.ros.node import reliable
 from openarm_evaluation.judging.film import Picture
 from openarm_evaluation.judging.judge import Sample

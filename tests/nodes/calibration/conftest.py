@@ -11,7 +11,8 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 
 from openarm_calibration.board.board import CircleGrid
 from openarm_common import se3
-from openarm_common.ros.convert import array_to_image, info_from_intrinsics, ns_to_stamp
+from openarm_common.ros.convert import info_from_intrinsics, ns_to_stamp
+from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND, QOS_SENSOR
 from tests.openarm_calibration.known_session import Known, photograph
 

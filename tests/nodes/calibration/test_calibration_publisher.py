@@ -14,7 +14,8 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics, load_cameras, true_mount
 from openarm_common.errors import OpenArmError
 from openarm_common.records import default_folder
-from openarm_common.ros.convert import intrinsics_from_info, transform_to_matrix
+from openarm_common.ros.convert import transform_to_matrix
+from openarm_common.ros.images import lens_from_info
 from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF
 from openarm_common.scene.scene import load_scene
 
@@ -106,7 +107,7 @@ def test_the_intrinsics_of_the_calibration_in_use_are_latched_and_taken_back_wit
     wrist = ros.hear(CameraInfo, "/calibration/wrist/camera_info", QOS_LATCHED)
     overhead = ros.hear(CameraInfo, "/calibration/overhead/camera_info", QOS_LATCHED)
     ros.spin_until(lambda: wrist and overhead, what="camera infos")
-    assert intrinsics_from_info(wrist[-1]) == optics
+    assert lens_from_info(wrist[-1]).intrinsics == optics
     assert overhead[-1].width == 0, "the mount is nominal"
     store.save(stored(0.11, None))
     ros.spin_until(lambda: wrist[-1].width == 0, what="a calibration without intrinsics")

@@ -64,7 +64,7 @@ def read_document(path: Path) -> Any:
     plain = re.sub(r"\A%YAML:1\.0\s*(\n---)?", "", text).replace("!!opencv-matrix", "")
     parts = [part for part in re.split(r"^---\s*$", plain, flags=re.MULTILINE) if part.strip()]
     if len(parts) < 2:  # else it is a stream of messages, as ROS prints them
-        return parse_yaml(plain, str(path))
+        return parse_yaml(parts[0] if parts else "", str(path))
     return [parse_yaml(part, str(path)) for part in parts]
 
 
