@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo
 
 from openarm_bringup.bags.bag import Bag
 from openarm_bringup.bags.ros.messages import contents, messages_of
@@ -26,7 +27,7 @@ from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import stamp_to_ns, transform_to_matrix
-from openarm_common.ros.images import color_of, depth_of, grey_image
+from openarm_common.ros.images import AnyImage, color_of, depth_of, grey_image
 from openarm_common.ros.tf import table_height
 from openarm_common.scene.scene import load_scene
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
@@ -36,11 +37,10 @@ from openarm_perception.detection.detector import ColorDetector, ColorDetectorCo
 from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
 from openarm_perception.detection.pipeline import Pipeline
 from openarm_perception.geometry.depth import DepthLimits
+from openarm_perception.ros.frames import camera_topics
 
 #: Boards are searched for twice a second in each camera: it is held still for as long, and the search is slow.
 _BOARD_PERIOD_NS = 500_000_000
-#: Streams of a camera, and where a shot has them.
-_STREAMS = {"color/image_raw": "color", "depth/image_raw": "depth", "depth/camera_info": "info"}
 
 
 @dataclass
@@ -49,8 +49,8 @@ class _Shot:
 
     camera: CameraConfig
     t_ns: int
-    color: Image | None = None
-    depth: Image | None = None
+    color: AnyImage | None = None
+    depth: AnyImage | None = None
     info: CameraInfo | None = None
 
 
@@ -116,7 +116,12 @@ def numbers_of(
 
 def _read(bag: Bag, description: RobotDescription) -> tuple[list[_Shot], RobotStateBuffer]:
     cameras = {name: camera for name, camera in load_cameras().items() if camera.depth}
-    topics = {f"/{name}/{stream}": (name, part) for name in cameras for stream, part in _STREAMS.items()}
+    kinds = {topic: kind for topic, (kind, _) in bag.topics.items()}
+    topics: dict[str, tuple[str, str]] = {}
+    for name in cameras:
+        with suppress(OpenArmError):  # the bag has no such camera
+            chosen = camera_topics({topic: kind for topic, kind in kinds.items() if topic.startswith(f"/{name}/")})
+            topics |= {chosen.color: (name, "color"), chosen.depth: (name, "depth"), chosen.info: (name, "info")}
     found = messages_of(bag, [*topics, "/joint_states", "/tf_static"])
     states = RobotStateBuffer(description, capacity=max(len(found["/joint_states"]), 1))
     for message in found["/tf_static"]:

@@ -24,7 +24,8 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.images import grey_image, lens_from_info
 
-_IMAGES = "/color/image_raw"
+#: Ends of the topics of images: as they are, or compressed.
+_IMAGES = ("/color/image_raw", "/color/image_raw/compressed")
 _INFOS = "/color/camera_info"
 
 
@@ -75,7 +76,7 @@ def samples_of(
     link = head.parent if head.setup == "in_hand" else head.carrier
     ours = link in own.links and all(joint.name in own.joints for joint in small.robot.chain(link))
     samples = SampleSet(head, own.described if ours else small.robot, foreign=not ours)
-    images = f"/{camera}{_IMAGES}"
+    images = next(topic for end in _IMAGES if bag.counts.get(topic := f"/{camera}{end}"))
     # The first bytes of a message are its stamp; the pixels are read in a second pass, where they are needed.
     with contents(bag):
         stamps = [stamp_of(record.data) for record in bag.records([images])]
@@ -90,13 +91,14 @@ def samples_of(
 
 def _camera(bag: Bag, name: str) -> str:
     """Return the camera whose images are used."""
-    there = sorted(topic[1 : -len(_IMAGES)] for topic, count in bag.counts.items() if topic.endswith(_IMAGES) and count)
+    counted = [topic for topic, count in bag.counts.items() if count]
+    there = sorted({topic[1 : -len(end)] for topic in counted for end in _IMAGES if topic.endswith(end)})
     if name and name not in there:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"{bag.path} has no images of camera {name!r}; cameras: {', '.join(there) or 'none'}"
         )
     if not name and len(there) != 1:
-        expected = "give one by --camera" if there else f"expected a topic /NAME{_IMAGES} of sensor_msgs/msg/Image"
+        expected = "give one by --camera" if there else f"expected a topic /NAME{_IMAGES[0]}, or that with /compressed"
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             f"{bag.path} has images of {len(there)} cameras: {', '.join(there) or 'none'}; {expected}",
