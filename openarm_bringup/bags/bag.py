@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags: standard rosbag2 folders with MCAP files, written and read by rosbags without deserialising messages.
+"""Bags: rosbag2 folders with MCAP files are written by rosbags, those and others are read; nothing is deserialised.
 
 Stamps of a bag are when a message was received, ns of the system clock. The text of a message definition is made from
 the installed Python class, so that every installed type can be recorded, also a user's own.
@@ -8,33 +8,38 @@ the installed Python class, so that every installed type can be recorded, also a
 from __future__ import annotations
 
 import shutil
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-import yaml
-from rosbags.interfaces import Connection, Qos
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
-from rosbags.rosbag2.errors import ReaderError
-from rosbags.rosbag2.storage_mcap import McapWriter, zstd
+from rosbags.interfaces import Connection, Qos, QosDurability, QosReliability
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from openarm_bringup.bags.definitions import changed_type, definition, nested_types
-from openarm_bringup.bags.mcap import DAMAGE, is_closed, mend, unpack
+from openarm_bringup.bags.definitions import changed_type, definition, event_definition, is_event, nested_types
+from openarm_bringup.bags.files import ZSTD, find, open_storage
+from openarm_bringup.bags.mcap import unpack
+from openarm_bringup.bags.mcap_storage import McapStorage
+from openarm_bringup.bags.storage import DAMAGE, Channel, Storage, merged
 from openarm_bringup.messages import interface
-from openarm_common.config import MAX_YAML_BYTES, load_yaml
 from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.printable import printable
 
 #: This much of the disk is left free, so that the bag can still be closed.
 SPARE_BYTES = 200 * 2**20
 #: Of zstd. Clouds come out smaller at 1 than at its default of 3, in half the time.
 _LEVEL = 1
-#: By which a file of messages may have been compressed.
-_LARGEST_RATIO = 200
+#: Errors that may come from what was left out of a bag.
+_MISSING = (Code.INVALID_ARGUMENT, Code.NOTHING_DETECTED, Code.NO_TRANSFORM)
+#: Topics that an error names.
+_NAMED = 8
+#: As the middleware writes it.
+_NO_HASH = "INVALID"
 
 
 def check_room(folder: Path) -> int:
@@ -128,9 +133,13 @@ class BagWriter:
         Raises:
             OpenArmError: INVALID_ARGUMENT, when no installed package has its type.
         """
-        self._learn(kind)
+        text, type_hash = None, None  # by the type store
+        if is_event(kind):  # which knows messages only
+            text, type_hash = event_definition(kind), _NO_HASH
+        else:
+            self._learn(kind)
         self._connections[topic] = self._writer.add_connection(
-            topic, kind, typestore=self._types, offered_qos_profiles=[qos]
+            topic, kind, typestore=self._types, msgdef=text, rihs01=type_hash, offered_qos_profiles=[qos]
         )
 
     def _learn(self, kind: str) -> None:
@@ -165,32 +174,40 @@ class Bag:
 
     Attributes:
         path: As it was given.
-        topics: Type and offered quality of service of each topic.
+        topics: Type and offered quality of service of each topic whose messages are CDR of a ROS 2 type.
         counts: Messages by topic.
+        left_out: Why messages are left out, by topic: of another encoding, or of another type than most of the topic.
         custom: What was kept with it.
         start_ns: Of the first message.
         duration_s: To the last message.
         mended: How many bytes of an unfinished file were given up; None for a bag that was closed in order.
     """
 
-    def __init__(self, path: Path, reader: Reader, mended: int | None) -> None:
+    def __init__(self, path: Path, files: Sequence[Storage], custom: Mapping[str, str]) -> None:
         self.path = path
-        self.mended = mended
-        self._reader = reader
-        # Messages that are compressed one by one are unpacked here, where their size is bounded.
-        storage = reader.storage
-        self._packed = storage.metadata.compression_mode == "message"
-        storage.metadata = storage.metadata._replace(compression_mode=None)
-        self.topics: dict[str, tuple[str, Qos | None]] = {}
-        self.counts: dict[str, int] = {}
-        for connection in reader.connections:
-            profiles: Sequence[Qos] = getattr(connection.ext, "offered_qos_profiles", [])
-            self.topics[connection.topic] = (connection.msgtype, profiles[0] if profiles else None)
-            self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
-        self._definitions = {connection.topic: connection.msgdef for connection in reader.connections}
-        self.custom: Mapping[str, str] = reader.storage.metadata.custom or {}
-        self.start_ns = reader.start_time
-        self.duration_s = max(0, reader.duration - 1) * 1e-9
+        self._files = files
+        self.custom = custom
+        lost = [file.given_up for file in files if isinstance(file, McapStorage) and file.given_up is not None]
+        self.mended = sum(lost) if lost else None
+        by_topic: defaultdict[str, list[Channel]] = defaultdict(list[Channel])
+        for channel in (channel for file in files for channel in file.channels):
+            by_topic[channel.topic].append(channel)
+        self._channels: dict[str, list[Channel]] = {}
+        self.left_out: dict[str, str] = {}
+        for topic, channels in by_topic.items():
+            counts = Counter[str]()
+            for channel in channels:
+                counts[channel.encoding or channel.type] += channel.count
+            ours = {channel.type for channel in channels if not channel.encoding}
+            if kind := max(ours, key=lambda one: (counts[one], one), default=""):
+                self._channels[topic] = [c for c in channels if not c.encoding and c.type == kind]
+            if others := [f"{count} messages of {what}" for what, count in counts.items() if what != kind]:
+                self.left_out[topic] = ", ".join(others)
+        self.topics = {topic: (some[0].type, _strongest(some)) for topic, some in self._channels.items()}
+        self.counts = {topic: sum(channel.count for channel in some) for topic, some in self._channels.items()}
+        with_messages = [file for file in files if file.end_ns >= file.start_ns]
+        self.start_ns = min((file.start_ns for file in with_messages), default=0)
+        self.duration_s = (max((file.end_ns for file in with_messages), default=0) - self.start_ns) * 1e-9
 
     def why_not(self, topic: str) -> str:
         """Return why the messages of a topic are not of the installed type of that name; empty when they are.
@@ -199,8 +216,10 @@ class Bag:
             OpenArmError: INVALID_ARGUMENT, when no installed package has the type.
         """
         kind, _ = self.topics[topic]
-        changed = changed_type(self._definitions[topic], kind)
-        return f"{topic} was recorded with other fields of {changed} than the installed ones" if changed else ""
+        for recorded in dict.fromkeys(channel.definition for channel in self._channels[topic]):
+            if changed := changed_type(recorded, kind):
+                return f"{topic} was recorded with other fields of {changed} than the installed ones"
+        return ""
 
     def records(self, topics: Sequence[str] | None = None, start_s: float = 0.0) -> Iterator[Record]:
         """Messages in the order in which they were received.
@@ -209,96 +228,70 @@ class Bag:
             topics: Only these; None takes all.
             start_s: Only from this long after the first on.
         """
-        chosen = [c for c in self._reader.connections if topics is None or c.topic in topics]
-        if not chosen:
-            return
-        start = self.start_ns + round(start_s * 1e9) if start_s else None
+        chosen = {id(c) for t, some in self._channels.items() if topics is None or t in topics for c in some}
+        start_ns = self.start_ns + round(start_s * 1e9) if start_s else None
+        sources = [
+            (file.start_ns, file.rows(wanted, start_ns))
+            for file in self._files
+            if (wanted := [channel for channel in file.channels if id(channel) in chosen])
+        ]
         try:
-            for connection, t_ns, data in self._reader.messages(chosen, start=start):
-                content = unpack(data) if self._packed else bytes(data)
-                yield Record(connection.topic, connection.msgtype, t_ns, content)
-        except DAMAGE as error:
+            for t_ns, channel, data in merged(sources):
+                content = unpack(data) if data.startswith(ZSTD) else data
+                yield Record(channel.topic, channel.type, t_ns, content)
+        except (*DAMAGE, OSError) as error:
             raise damaged(self.path, error) from error
+
+
+def _strongest(channels: Sequence[Channel]) -> Qos | None:
+    """Return a quality of service that serves every subscriber which one of several publishers served."""
+    offered = [channel.qos for channel in channels if channel.qos is not None]
+    if not offered:
+        return None
+    latched = [qos for qos in offered if qos.durability == QosDurability.TRANSIENT_LOCAL]
+    reliable = any(qos.reliability != QosReliability.BEST_EFFORT for qos in offered)
+    best = max(latched or offered, key=lambda qos: qos.depth)
+    return best._replace(reliability=QosReliability.RELIABLE) if reliable else best
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a rosbag2 folder or an MCAP file for reading.
+    """Open a rosbag2 folder, or a file of MCAP or of SQLite (.db3), for reading.
 
-    A recording that was cut short (SIGKILL, full disk) lacks its end: everything whole in it is kept, the end is
-    written again and the metadata made from the file.
+    A recording that was cut short (SIGKILL, full disk) lacks its end: everything whole in it is kept. Topics that are
+    no messages of ROS 2 are left out; an error that may come from this names them.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when it is missing, empty, truncated beyond use, or something else.
     """
-    if not path.exists():
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no bag at {path}")
-    source, mended = path, None
-    if path.is_dir():
-        files = sorted(path.glob("*.mcap"))
-        if not (path / "metadata.yaml").exists():
-            if len(files) != 1:
-                raise OpenArmError(
-                    Code.INVALID_ARGUMENT,
-                    f"{path} is not a bag: expected metadata.yaml or one .mcap file, found "
-                    f"{', '.join(p.name for p in sorted(path.iterdir())[:5]) or 'nothing'}",
-                )
-            source = files[0]
-        elif cut := [file for file in files if not is_closed(file)]:
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT,
-                f"{cut[0]} was cut short after it had been recorded; copy the bag again, or open this file by itself: "
-                "all that is whole in it is kept",
-            )
-    if source.is_file() and source.suffix == ".mcap":
-        mended = mend(source)
-    elif source.is_file():
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} is not a bag: expected a folder of rosbag2 or an .mcap file")
     with ExitStack() as stack:
         try:
-            if source.is_dir():
-                source = _unpacked(source, stack)
-            reader = Reader(source)
-            reader.open()
-            stack.callback(_close, reader)
-            bag = Bag(path, reader, mended)
+            source = find(path, stack)
+            files = [stack.enter_context(closing(open_storage(file))) for file in source.files]
+            custom = source.custom or next((file.custom for file in files if file.custom), {})
+            bag = Bag(path, files, custom)
         except (*DAMAGE, OSError) as error:
             raise damaged(path, error) from error
-        yield bag
+        if bag.left_out and not bag.topics:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"{path} has no messages of ROS 2: {listed(bag.left_out)}; expected CDR of types in ros2msg or ros2idl,"
+                " as `ros2 bag record` and `openarm record` write: record or convert these topics as ROS 2 messages",
+            )
+        try:
+            yield bag
+        except OpenArmError as error:
+            if not bag.left_out or error.code not in _MISSING:
+                raise
+            text = f"{error.message}; left out of {path}, which nothing here can read: {listed(bag.left_out)}"
+            raise OpenArmError(error.code, text) from error
 
 
-def _close(reader: Reader) -> None:
-    with suppress(*DAMAGE):  # what damaged metadata say of it, the reader tidies up
-        reader.close()
-
-
-def _unpacked(path: Path, stack: ExitStack) -> Path:
-    """Return the folder of a bag whose files are not compressed as a whole; one that is gets unpacked, within bounds.
-
-    Raises:
-        OpenArmError: CONFIG_INVALID, for metadata that is no YAML.
-        ReaderError: When a file unpacks to much more than a recording does.
-    """
-    size = (path / "metadata.yaml").stat().st_size
-    if size > MAX_YAML_BYTES:
-        raise ReaderError(f"metadata.yaml has {size} bytes, expected at most {MAX_YAML_BYTES}")
-    packed = sorted(path.glob("*.zst"))
-    if not packed:
-        return path
-    folder = Path(stack.enter_context(TemporaryDirectory()))
-    document = load_yaml(path / "metadata.yaml")
-    about = document["rosbag2_bagfile_information"]
-    about |= {"compression_format": "", "compression_mode": ""}
-    about["relative_file_paths"] = [name.removesuffix(".zst") for name in about["relative_file_paths"]]
-    (folder / "metadata.yaml").write_text(yaml.safe_dump(document), encoding="utf-8")
-    for file in packed:
-        most = _LARGEST_RATIO * file.stat().st_size + 2**20
-        with zstd.open(file, "rb") as source, (folder / file.stem).open("wb") as target:
-            while block := source.read(2**20):
-                target.write(block)
-                if target.tell() > most:
-                    raise ReaderError(f"{file.name} unpacks to more than {_LARGEST_RATIO} times its size")
-    return folder
+def listed(reasons: Mapping[str, str]) -> str:
+    """Return topics with what is said of each, in one line; of many, the first."""
+    parts = [f"{printable(topic, longest=100)}: {printable(why, longest=200)}" for topic, why in reasons.items()]
+    more = f" and {len(parts) - _NAMED} more" if len(parts) > _NAMED else ""
+    return "; ".join(parts[:_NAMED]) + more
 
 
 def damaged(path: Path, error: Exception) -> OpenArmError:

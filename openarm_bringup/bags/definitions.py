@@ -3,17 +3,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
-from openarm_bringup.bags.mcap import DAMAGE
+from openarm_bringup.bags.storage import DAMAGE
 from openarm_bringup.messages import interface
 from openarm_common.fields import SEQUENCE
 
 _LINE = "=" * 80
+_EVENT = "_Event"
 #: Definitions that are longer are not parsed, characters.
 _LONGEST = 200_000
 _PRIMITIVES = {"float": "float32", "double": "float64", "boolean": "bool", "octet": "byte"}
@@ -53,8 +55,27 @@ def nested_types(message: type[Any]) -> list[str]:
         base = (match["of"] or match["array"]) if match else kind
         if "/" in base:
             package, _, short = base.partition("/")
-            found.append(f"{package}/msg/{short.removeprefix('msg/')}")
+            # those of a service or an action have an underscore, and are next to what they are in
+            of = message.__module__.split(".")[1] if "_" in short else "msg"
+            found.append(f"{package}/{of}/{short.removeprefix('msg/')}")
     return found
+
+
+def is_event(kind: str) -> bool:
+    """Whether a type is that of the events of a service (`std_srvs/srv/SetBool_Event`)."""
+    return "/srv/" in kind and kind.endswith(_EVENT)
+
+
+def event_definition(kind: str) -> str:
+    """Return the text that rosbag2 keeps for the events of a service: its request and response.
+
+    Args:
+        kind: As `is_event`; installed.
+    """
+    service = interface(kind.removesuffix(_EVENT))
+    request, response = definition(service.Request), definition(service.Response)
+    nested = _nested([*nested_types(service.Request), *nested_types(service.Response)])
+    return f"{_LINE}\nSRV: {kind.removesuffix(_EVENT)}\n{request}---\n{response}{nested}"
 
 
 def full_definition(message: type[Any]) -> str:
@@ -63,7 +84,12 @@ def full_definition(message: type[Any]) -> str:
     Args:
         message: A class that rosidl generated: of a message, or of the request or response of a service.
     """
-    parts, waiting, seen = [definition(message)], nested_types(message), set[str]()
+    return definition(message) + _nested(nested_types(message))
+
+
+def _nested(waiting: list[str]) -> str:
+    """The definitions of types, and of those in them, each once."""
+    parts, seen = list[str](), set[str]()
     while waiting:
         name = waiting.pop(0)
         if name in seen:
@@ -89,9 +115,25 @@ def changed_type(recorded: MessageDefinition, kind: str) -> str:
     if recorded.format is MessageDefinitionFormat.NONE or not recorded.data.strip():
         return ""
     msg = recorded.format is MessageDefinitionFormat.MSG
-    try:
-        theirs = get_types_from_msg(recorded.data, kind) if msg else get_types_from_idl(recorded.data)
-    except (TypesysError, *DAMAGE):
-        return kind
-    ours = get_types_from_msg(full_definition(interface(kind)), kind)
-    return next((name for name, (_, fields) in ours.items() if theirs.get(name, ((), ()))[1] != fields), "")
+    if is_event(kind) and msg:
+        service = interface(kind.removesuffix(_EVENT))
+        parts = zip(_halves(recorded.data), (service.Request, service.Response), strict=True)
+    else:
+        parts = [(recorded.data, interface(kind))]
+    for text, message in parts:
+        try:
+            theirs = get_types_from_msg(text, kind) if msg else get_types_from_idl(text)
+        except (TypesysError, *DAMAGE):
+            return kind
+        ours = get_types_from_msg(full_definition(message), kind)
+        for name, (_, fields) in ours.items():
+            if theirs.get(name, ((), ()))[1] != fields:
+                return name
+    return ""
+
+
+def _halves(text: str) -> tuple[str, str]:
+    """The request and the response of a service's definition, each with the types in both."""
+    service, line, nested = re.sub(rf"\A{_LINE}\nSRV: .*\n", "", text).partition(_LINE)
+    request, _, response = f"\n{service}".partition("\n---")
+    return f"{request}\n{line}{nested}", f"{response}\n{line}{nested}"

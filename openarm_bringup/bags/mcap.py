@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The end of an MCAP file that was cut short is restored (https://mcap.dev/spec), and no file fills the memory.
+"""Records of MCAP files (https://mcap.dev/spec), unpacked within bounds, and the end of a file that was cut short.
 
 A file is a magic, records (one byte of kind, eight of length, content), a summary, a footer record and the magic again.
-Without the end no reader opens it, and without the summary's index of chunks none gives the messages of several topics
+Without the end few readers open it, and without the summary's index of chunks few give the messages of several topics
 in the order of their stamps, though all records before the cut are whole.
 """
 
@@ -11,34 +11,46 @@ from __future__ import annotations
 import os
 import struct
 from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from enum import IntEnum
 from functools import partial
-from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, decompress, zstd
 
-from openarm_common.errors import Code, OpenArmError, said
-
-#: What is raised where the content of a file is not what its format says.
-DAMAGE = (
-    ReaderError, zstd.ZstdError, struct.error, ArithmeticError, AssertionError, AttributeError, EOFError, LookupError,
-    MemoryError, RuntimeError, TypeError, ValueError,
-)  # fmt: skip
 MAGIC = b"\x89MCAP0\r\n"
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = range(1, 8)
-_CHUNK_INDEX, _STATISTICS, _DATA_END = 0x08, 0x0B, 0x0F
-#: Records of the data section; what follows them is a summary, which would be incomplete.
-_DATA = (_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, 0x09, 0x0C)
-_HEAD = struct.Struct("<BQ")
+RECORD = struct.Struct("<BQ")
 #: Of a chunk: first and last stamp, size unpacked, its CRC, length of the compression's name.
 _OF_CHUNK = struct.Struct("<QQQII")
-#: Of a message: channel, number, stamp.
-_OF_MESSAGE = struct.Struct("<HIQ")
+#: Of a message: channel, number, stamp, stamp of its publisher.
+_OF_MESSAGE = struct.Struct("<HIQQ")
 
 
+class Kind(IntEnum):
+    """Records; those from 0x80 on are of whoever wrote the file."""
+
+    HEADER = 0x01
+    FOOTER = 0x02
+    SCHEMA = 0x03
+    CHANNEL = 0x04
+    MESSAGE = 0x05
+    CHUNK = 0x06
+    INDEX = 0x07
+    CHUNK_INDEX = 0x08
+    ATTACHMENT = 0x09
+    STATISTICS = 0x0B
+    METADATA = 0x0C
+    DATA_END = 0x0F
+
+
+#: Records of the data section; what follows them is a summary, which would be incomplete.
+DATA = (
+    Kind.HEADER, Kind.SCHEMA, Kind.CHANNEL, Kind.MESSAGE, Kind.CHUNK, Kind.INDEX, Kind.ATTACHMENT, Kind.METADATA,
+    *range(0x80, 0x100),
+)  # fmt: skip
 #: Largest chunk or message, unpacked, bytes.
 MAX_UNPACKED = 256 * 2**20
 
@@ -67,6 +79,58 @@ DECOMPRESSORS["zstd"] = unpack
 DECOMPRESSORS["lz4"] = partial(unpack, kind="lz4")
 
 
+class MessageHead(NamedTuple):
+    """Channel and stamp, ns, of a message."""
+
+    channel: int
+    t_ns: int
+
+
+def message_head(content: bytes | memoryview) -> MessageHead:
+    """Return the head of the content of a message's record."""
+    channel, _, t_ns, _ = _OF_MESSAGE.unpack_from(content)
+    return MessageHead(channel, t_ns)
+
+
+def message_data(content: memoryview) -> bytes:
+    """Return what follows the head."""
+    return bytes(content[_OF_MESSAGE.size :])
+
+
+def records(content: memoryview) -> Iterator[tuple[int, int, memoryview]]:
+    """Yield kind, place and content of each record.
+
+    Raises:
+        ReaderError: When a record is longer than what there is.
+    """
+    at = 0
+    while at < len(content):
+        kind, length = RECORD.unpack_from(content, at)
+        start = at + RECORD.size
+        if start + length > len(content):
+            raise ReaderError(f"a record has {length} bytes, more than there are")
+        yield kind, at, content[start : start + length]
+        at = start + length
+
+
+def chunk_stamps(content: bytes | memoryview) -> tuple[int, int]:
+    """Return the first and the last stamp of a chunk, ns, from the first bytes of its content."""
+    return struct.unpack_from("<QQ", content)
+
+
+def chunk_records(content: memoryview) -> memoryview:
+    """Return the records of a chunk, unpacked.
+
+    Raises:
+        ReaderError: When it is damaged, or larger than `MAX_UNPACKED`.
+    """
+    _, _, unpacked, crc, name = _OF_CHUNK.unpack_from(content)
+    at = _OF_CHUNK.size + name
+    compression = bytes(content[_OF_CHUNK.size : at]).decode()
+    (packed,) = struct.unpack_from("<Q", content, at)
+    return memoryview(decompress(bytes(content[at + 8 : at + 8 + packed]), compression, unpacked, crc))
+
+
 def is_closed(path: Path) -> bool:
     """Whether a file has its end."""
     with path.open("rb") as file:
@@ -77,120 +141,63 @@ def is_closed(path: Path) -> bool:
         return file.read() == MAGIC
 
 
-def mend(path: Path) -> int | None:
-    """Give a file that was cut short its end; a file that has one is left as it is.
+def give_end(path: Path, chunks: Sequence[tuple[int, int]]) -> None:
+    """Give a file that was cut short its end, for other tools; what follows its last whole chunk is removed.
 
-    Returns:
-        Bytes after the last whole record, which were given up; None when there was nothing to mend.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, when it is no MCAP file, or nothing in it is whole, or it can't be written.
+    Args:
+        path: File that can be written.
+        chunks: Start and end of each chunk, all whole.
     """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            what = "is empty" if size == 0 else "is not an MCAP file (wrong magic at its start)"
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} {what}")
-    if is_closed(path):
-        return None
-    if not os.access(path, os.W_OK):
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"{path} was cut short, and can't be written to give it an end; copy it first"
-        )
-    try:
-        return _give_end(path, size)
-    except DAMAGE as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} was cut short and is damaged: {said(error)}") from error
-
-
-def _give_end(path: Path, size: int) -> int:
     with path.open("r+b") as file:
-        chunks, end = whole_chunks(file, size)
         # Whether all indexes of the last chunk were written only its content shows: they are made again.
-        # After a loss of power its content may be missing, whatever its length: then it is given up.
-        indexes: list[bytes] | None = None
-        while chunks and (indexes := _indexes(file, chunks[-1][0])) is None:
-            end, _ = chunks.pop()
-        if not indexes:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} was cut short before anything whole was written")
-        file.seek(sum(chunks[-1]))
-        file.write(b"".join(_record(_INDEX, index) for index in indexes))
+        file.seek(chunks[-1][1])
+        file.write(b"".join(_record(Kind.INDEX, index) for index in _indexes(file, *chunks[-1])))
         file.truncate()
-        indexed = [_chunk_index(file, *chunk, until) for chunk, until in _until(chunks, file.tell())]
+        starts = [*(start for start, _ in chunks[1:]), file.tell()]
+        indexed = [_chunk_index(file, *chunk, until) for chunk, until in zip(chunks, starts, strict=True)]
         file.seek(0, os.SEEK_END)
-        file.write(_record(_DATA_END, bytes(4)))
+        file.write(_record(Kind.DATA_END, bytes(4)))
         summary = file.tell()
         # Counts of nothing: readers that find no schema here count for themselves while they search for them.
-        file.write(b"".join(_record(_CHUNK_INDEX, index) for index in indexed))
-        file.write(_record(_STATISTICS, bytes(46)))
-        file.write(_record(_FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
-    return size - end
+        file.write(b"".join(_record(Kind.CHUNK_INDEX, index) for index in indexed))
+        file.write(_record(Kind.STATISTICS, bytes(46)))
+        file.write(_record(Kind.FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
 
 
 def _record(kind: int, content: bytes) -> bytes:
-    return _HEAD.pack(kind, len(content)) + content
+    return RECORD.pack(kind, len(content)) + content
 
 
-def whole_chunks(file: BinaryIO, size: int) -> tuple[list[tuple[int, int]], int]:
-    """Start and length of each whole chunk, and where the last whole record of the data ends."""
-    at, chunks = len(MAGIC), list[tuple[int, int]]()
-    while at + _HEAD.size <= size:
-        file.seek(at)
-        kind, length = _HEAD.unpack(file.read(_HEAD.size))
-        if kind not in _DATA or at + _HEAD.size + length > size:
-            break
-        if kind == _CHUNK:
-            chunks.append((at, _HEAD.size + length))
-        at += _HEAD.size + length
-    return chunks, at
-
-
-def _until(chunks: list[tuple[int, int]], end: int) -> list[tuple[tuple[int, int], int]]:
-    """Each chunk, and where the next one begins."""
-    return list(zip(chunks, [*(start for start, _ in chunks[1:]), end], strict=True))
-
-
-def _indexes(file: BinaryIO, start: int) -> list[bytes] | None:
-    """Contents of the index records of a chunk: of each channel, stamp and place of its messages; None if damaged."""
+def _indexes(file: BinaryIO, start: int, end: int) -> list[bytes]:
+    """Contents of the index records of a chunk: of each channel, stamp and place of its messages."""
     found: dict[int, bytearray] = defaultdict(bytearray)
-    try:
-        file.seek(start + _HEAD.size)
-        _, _, unpacked, crc, name = _OF_CHUNK.unpack(file.read(_OF_CHUNK.size))
-        compression = file.read(name).decode()
-        (packed,) = struct.unpack("<Q", file.read(8))
-        content = BytesIO(decompress(file.read(packed), compression, unpacked, crc))
-        while len(head := content.read(_HEAD.size)) == _HEAD.size:
-            place = content.tell() - _HEAD.size
-            kind, length = _HEAD.unpack(head)
-            if kind not in (_SCHEMA, _CHANNEL, _MESSAGE):
-                return None
-            if kind == _MESSAGE:
-                channel, _, stamp = _OF_MESSAGE.unpack(content.read(_OF_MESSAGE.size))
-                found[channel] += struct.pack("<QQ", stamp, place)
-            content.seek(place + _HEAD.size + length)
-    except DAMAGE:
-        return None
+    file.seek(start + RECORD.size)
+    for kind, place, content in records(chunk_records(memoryview(file.read(end - start - RECORD.size)))):
+        if kind == Kind.MESSAGE:
+            channel, t_ns = message_head(content)
+            found[channel] += struct.pack("<QQ", t_ns, place)
+    file.seek(end)
     return [struct.pack("<HI", channel, len(entries)) + entries for channel, entries in found.items()]
 
 
-def _chunk_index(file: BinaryIO, start: int, length: int, until: int) -> bytes:
+def _chunk_index(file: BinaryIO, start: int, end: int, until: int) -> bytes:
     """Content of the summary's record of a chunk, whose own indexes lie between it and `until`."""
-    file.seek(start + _HEAD.size)
+    file.seek(start + RECORD.size)
     first, last, unpacked, _, name = _OF_CHUNK.unpack(file.read(_OF_CHUNK.size))
     compression = file.read(name)
     packed = file.read(8)
-    offsets, at = b"", start + length
+    offsets, at = b"", end
     while at < until:
         file.seek(at)
-        kind, size = _HEAD.unpack(file.read(_HEAD.size))
-        if kind != _INDEX:
+        kind, size = RECORD.unpack(file.read(RECORD.size))
+        if kind != Kind.INDEX:
             break
         offsets += file.read(2) + struct.pack("<Q", at)
-        at += _HEAD.size + size
+        at += RECORD.size + size
     return (
-        struct.pack("<QQQQI", first, last, start, length, len(offsets))
+        struct.pack("<QQQQI", first, last, start, end - start, len(offsets))
         + offsets
-        + struct.pack("<QI", at - start - length, name)
+        + struct.pack("<QI", at - end, name)
         + compression
         + packed
         + struct.pack("<Q", unpacked)

@@ -110,7 +110,7 @@ def replay(
             Code.INVALID_ARGUMENT, f"--rate, --start, --duration: 0 or more, got {rate, start, duration}"
         )
     from openarm_bringup.bags.about import require_robot
-    from openarm_bringup.bags.bag import open_bag
+    from openarm_bringup.bags.bag import listed, open_bag
 
     names = dict(_split(pair) for pair in remap)
     with open_bag(bag) as opened:
@@ -131,14 +131,13 @@ def replay(
                 player.wait_idle(1.0, 60.0)
         mended = f"; it was cut short: {opened.mended} bytes at its end were not whole" if opened.mended else ""
     data = {"bag": str(bag), "messages": player.published, "late_ms": player.late_ms}
-    data |= {"unknown_types": player.unknown, "changed_types": player.changed, "left_to_graph": player.left}
+    data |= {"left_out": player.left_out, "left_to_graph": player.left}
     if stop.is_set():
         return Outcome(False, f"stopped after {player.published} messages", Code.CANCELLED, data)
-    if player.published == 0:
-        return Outcome(False, f"nothing to replay in {bag}{mended}", Code.NOTHING_DETECTED, data)
     left = f"; left to the graph, which makes them itself: {', '.join(player.left)}" if player.left else ""
-    left += f"; left out: {'; '.join(player.changed)}" if player.changed else ""
-    left += f"; not installed, left out: {', '.join(player.unknown)}" if player.unknown else ""
+    left += f"; left out: {listed(player.left_out)}" if player.left_out else ""
+    if player.published == 0:
+        return Outcome(False, f"nothing to replay in {bag}{mended}{left}", Code.NOTHING_DETECTED, data)
     return Outcome(True, f"{player.published} messages of {bag}{mended}{left}", data=data)
 
 
@@ -155,7 +154,7 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
     """
     from openarm_bringup.bags import golden as stored
     from openarm_bringup.bags.about import require_robot
-    from openarm_bringup.bags.bag import open_bag
+    from openarm_bringup.bags.bag import listed, open_bag
     from openarm_bringup.bags.ros.bag import numbers_of
     from openarm_bringup.progress import progress
 
@@ -169,20 +168,22 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
         task = shown.add_task("frames", total=None)
         numbers = numbers_of(opened, scene=scene, on_progress=lambda n, of: shown.update(task, completed=n, total=of))
     data: dict[str, Any] = {"bag": str(bag), "golden": str(path), "numbers": numbers, **kept}
+    data["left_out"] = opened.left_out
+    left = f"; left out of the bag: {listed(opened.left_out)}" if opened.left_out else ""
     if shown_only:
         text = "\n".join(f"{name}: {value}" for name, value in {**kept, **numbers}.items())
         return Outcome(
-            True, f"{len(numbers)} numbers of {bag}; --update stores them to compare with", data=data, text=text
+            True, f"{len(numbers)} numbers of {bag}; --update stores them to compare with{left}", data=data, text=text
         )
     if update:
         stored.write(path, numbers, expected)
-        return Outcome(True, f"{len(numbers)} numbers written to {path}", data=data)
+        return Outcome(True, f"{len(numbers)} numbers written to {path}{left}", data=data)
     differences = stored.compare(expected, numbers)
     data["differences"] = [str(difference) for difference in differences]
     if differences:
-        message = f"{len(differences)} of {len(expected)} numbers differ from {path}"
+        message = f"{len(differences)} of {len(expected)} numbers differ from {path}{left}"
         return Outcome(False, message, Code.STALE_DATA, data, "\n".join(data["differences"]))
-    return Outcome(True, f"{len(numbers)} numbers are as {path} says", data=data)
+    return Outcome(True, f"{len(numbers)} numbers are as {path} says{left}", data=data)
 
 
 def _split(pair: str) -> tuple[str, str]:

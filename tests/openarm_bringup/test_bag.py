@@ -12,12 +12,12 @@ from std_msgs.msg import String
 
 from openarm_bringup.bags.bag import BagWriter, open_bag
 from openarm_bringup.bags.definitions import definition
-from openarm_bringup.bags.mcap import whole_chunks
 from openarm_bringup.bags.ros.listener import from_profile
 from openarm_bringup.bags.ros.player import to_profile
 from openarm_bringup.messages import interface
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+from tests.openarm_bringup.mcap_files import chunks_of
 
 
 def write(path: Path, count: int, size: int = 10) -> Path:
@@ -103,9 +103,9 @@ def test_a_last_chunk_whose_content_never_reached_the_disk_is_given_up(tmp_path:
     (path / "metadata.yaml").unlink()
     file = path / "bag.mcap"
     with file.open("r+b") as data:
-        (*_, (start, length)), _ = whole_chunks(data, file.stat().st_size)
+        start, end = chunks_of(file)[-1]
         data.seek(start + 100)
-        data.write(bytes(length - 100))
+        data.write(bytes(end - start - 100))
         data.truncate()
     with open_bag(path) as bag:
         assert bag.mended is not None

@@ -20,6 +20,7 @@ from openarm_bringup.bags.ros.listener import from_profile
 from openarm_bringup.bags.ros.messages import messages_of
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import QOS_COMMAND
+from tests.openarm_bringup.mcap_files import chunks_of
 
 
 def _write(path: Path, data: list[bytes], *, compress: bool = True, kind: str = "std_msgs/msg/String") -> Path:
@@ -80,10 +81,8 @@ def _unfinished(path: Path, count: int) -> Path:
     """A bag of one chunk that was never finished, without an index, of many messages."""
     data = serialize_message(String(data="x"))
     path = _write(path, [data], compress=False) / "bag.mcap"
-    with path.open("rb") as file:
-        ((start, length), *_), _ = mcap.whole_chunks(file, path.stat().st_size)
-        file.seek(start)
-        chunk = file.read(length)
+    start, end = chunks_of(path)[0]
+    chunk = path.read_bytes()[start:end]
     head, (first, last, _, _, name) = chunk[:9], mcap._OF_CHUNK.unpack_from(chunk, 9)
     at = 9 + mcap._OF_CHUNK.size + name + 8
     records = chunk[at:]

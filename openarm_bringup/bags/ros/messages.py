@@ -10,7 +10,7 @@ from typing import Any
 from rclpy.serialization import deserialize_message
 
 from openarm_bringup.bags.bag import Bag, Record, damaged
-from openarm_bringup.bags.mcap import DAMAGE
+from openarm_bringup.bags.storage import DAMAGE
 from openarm_bringup.messages import interface
 from openarm_common.errors import Code, OpenArmError
 

@@ -11,13 +11,15 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.validate_full_topic_name import validate_full_topic_name
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 
-from openarm_bringup.bags.bag import Bag, Record
+from openarm_bringup.bags.bag import Bag, Record, listed
 from openarm_bringup.bags.ros.messages import no_message
 from openarm_bringup.messages import interface
 from openarm_bringup.supervision.environment import profiled, write_profile
@@ -42,43 +44,40 @@ class Player(ContextNode):
 
     Args:
         bag: Open.
-        topics: Only these; None takes all whose type is installed.
+        topics: Only these; None takes all that can be published.
         names: New names of topics.
         clock: Publish /clock from the bag's stamps when it holds none.
 
     Attributes:
         published: Messages so far.
-        unknown: Types that no installed package has.
-        changed: Why topics are left out whose type has other fields now: subscribers would misread the bytes.
+        left_out: Why topics are left out: their encoding, name or type; subscribers would misread other fields.
         left: Topics that the graph publishes itself, and that are left to it.
         late_ms: The most that a message was published after its time.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when a topic that is asked for can't be published.
     """
 
     def __init__(self, bag: Bag, topics: Sequence[str] | None, names: Mapping[str, str], *, clock: bool) -> None:
         self.published = 0
         self.late_ms = 0.0
         self._bag = bag
+        asked = [topic for topic in bag.topics if topics is None or topic in topics]
+        refused = {topic: why for topic in asked if (why := _why_not(bag, topic, names.get(topic, topic)))}
+        if topics is not None and refused:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{bag.path} can't be replayed: {listed(refused)}")
+        self.left_out = {**bag.left_out, **refused}
         self._folder = tempfile.TemporaryDirectory()
         spec = NodeSpec(module="openarm_bringup", large_messages=True, segment_mib=24)
         profile = write_profile(spec, Path(self._folder.name) / "fastdds.xml")
         with profiled(profile):
             super().__init__("openarm_player")
         self._publishers: dict[str, Publisher] = {}
-        self.changed: list[str] = []
-        missing: set[str] = set()
-        for topic, (kind, qos) in bag.topics.items():
-            if topics is not None and topic not in topics:
-                continue
-            try:
-                message = interface(kind)
-            except OpenArmError:
-                missing.add(kind)
-                continue
-            if why := bag.why_not(topic):
-                self.changed.append(why)
-                continue
-            self._publishers[topic] = self._node.create_publisher(message, names.get(topic, topic), to_profile(qos))
-        self.unknown = sorted(missing)
+        for topic in asked:
+            if topic not in self.left_out:
+                kind, qos = bag.topics[topic]
+                name = names.get(topic, topic)
+                self._publishers[topic] = self._node.create_publisher(interface(kind), name, to_profile(qos))
         self.left: list[str] = []
         self._all = topics is None
         own_clock = clock and _CLOCK not in self._publishers
@@ -210,6 +209,19 @@ class Player(ContextNode):
                     topic = max(heard, key=lambda key: heard[key])
                     raise OpenArmError(Code.TIMEOUT, f"{topic} is still published {limit_s:g} s after the bag's end")
                 self._executor.spin_once(timeout_sec=0.1)
+
+
+def _why_not(bag: Bag, topic: str, name: str) -> str:
+    """Return why the messages of a topic can't be published under a name; empty when they can."""
+    kind, _ = bag.topics[topic]
+    try:
+        validate_full_topic_name(name if name.startswith("/") else f"/{name}")
+        interface(kind)
+        return bag.why_not(topic)
+    except OpenArmError as error:
+        return f"{kind} can't be published: {error.message}"
+    except InvalidTopicNameException:
+        return "this is no name of a topic in ROS 2; give another by --remap FROM:=TO"
 
 
 def to_profile(qos: Qos | None) -> QoSProfile:
