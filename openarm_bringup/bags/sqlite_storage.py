@@ -68,7 +68,7 @@ class SqliteStorage:
 
     def _rows(self, query: str, values: Collection[object] = ()) -> Iterator[tuple[Any, ...]]:
         self._steps = 0
-        yield from self._database.execute(query, tuple(values))
+        return self._database.execute(query, tuple(values))
 
     def _tables(self) -> Mapping[str, tuple[str, ...]]:
         """Return the columns of each table of rosbag2 that there is."""
@@ -80,9 +80,8 @@ class SqliteStorage:
             if kind != "table" or str(text).upper().startswith("CREATE VIRTUAL") or any(c[6] for c in columns):
                 raise ReaderError(f"its {name} is computed, expected a plain table")
             found[name] = tuple(str(column[1]) for column in columns)
-        if missing := {"topics", "messages"} - found.keys():
-            known = ", ".join(sorted(found)) or "none of them"
-            raise ReaderError(f"a recording of rosbag2 has tables topics and messages; {missing} missing, has {known}")
+        if not {"topics", "messages"} <= found.keys():
+            raise ReaderError("it has no tables topics and messages, as a recording of rosbag2 has")
         return found
 
     def _open(self) -> None:

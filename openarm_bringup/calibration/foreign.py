@@ -38,12 +38,13 @@ def imported(path: Path, given: Foreign) -> Outcome:
     Raises:
         OpenArmError: What is wrong with file or options; DEGENERATE, when the poses determine nothing.
     """
+    from openarm_bringup.bags.files import is_recording
     from openarm_calibration.foreign.explain import Unexplained, table
     from openarm_calibration.foreign.pose_source import read_source
 
     if not path.exists():
         raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no {path}")
-    if path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists():
+    if is_recording(path):
         _refuse(given, "a bag")
         return _of_bag(path, given)
     source = read_source(path, given.with_, given.columns, given.roles)

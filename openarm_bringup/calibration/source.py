@@ -115,9 +115,10 @@ def opened(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str, A
     Raises:
         OpenArmError: What is wrong with the file or the options.
     """
+    from openarm_bringup.bags.files import is_recording
     from openarm_calibration.handeye.offline import without_named
 
-    if path.is_dir() or path.suffix == ".mcap":
+    if path.is_dir() or is_recording(path):
         samples, digest, stills, text = _from_bag(path, source)
     else:
         samples, digest = _from_session(path, source)
@@ -156,8 +157,8 @@ def _from_session(path: Path, source: Source) -> tuple[SampleSet, str]:
     if given:
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
-            f"{', '.join(given)}: for a bag (folder of rosbag2, or .mcap) only; a session file such as {path} says it"
-            " itself",
+            f"{', '.join(given)}: for a bag (folder of rosbag2, .mcap, .db3) only; a session file such as {path} says"
+            " it itself",
         )
     return load_session(path, RobotDescription.load())
 

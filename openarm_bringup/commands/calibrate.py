@@ -70,7 +70,7 @@ def solve(
     """Solve a session file or a bag and say how good the result is.
 
     Args:
-        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
+        samples: Session file (.npz), or a bag: folder of rosbag2, .mcap or .db3.
         algorithm: REFINED, or a closed form: TSAI PARK HORAUD ANDREFF DANIILIDIS SHAH LI.
         free_intrinsics: Estimate focal lengths and principal point as well, where those of camera_info are in doubt.
         save: Store the result, unless it fails.
@@ -96,7 +96,7 @@ def check(
     alone. The board must not have moved since the samples.
 
     Args:
-        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
+        samples: Session file (.npz), or a bag: folder of rosbag2, .mcap or .db3.
         touches: CSV file of `openarm calibrate touch`.
         tip: That touched, in the frame of the tool centre point, m.
         steady: Standard deviation of a touch by axis, m.
@@ -115,7 +115,7 @@ def save(samples: Path, *, algorithm: str = "REFINED", force: bool = False, sour
     """Solve a session file or a bag and store the result; a running graph takes it over at once.
 
     Args:
-        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
+        samples: Session file (.npz), or a bag: folder of rosbag2, .mcap or .db3.
         algorithm: As for `solve`.
         force: Store also what fails the limits.
     """
@@ -166,7 +166,7 @@ def report(samples: Path, out: Path, *, source: Source = ALL_SAMPLES) -> Outcome
     """Write a page with pictures on a session file or a bag: coverage, residuals, poses, samples, methods.
 
     Args:
-        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
+        samples: Session file (.npz), or a bag: folder of rosbag2, .mcap or .db3.
         out: HTML file to write.
     """
     from openarm_calibration.report.report import page

@@ -17,7 +17,7 @@ def import_(source: Path, *, given: Foreign = NOTHING) -> Outcome:
     """Solve data of another tool or robot: pairs of poses, poses with images or corners, or a bag.
 
     Read are samples of easy_handeye2 and moveit_calibration; YAML, JSON, OpenCV's FileStorage, .npz and .npy with poses
-    in any usual form; tables (CSV, TUM, text); a folder with a file for each pose; rosbag2 and MCAP.
+    in any usual form; tables (CSV, TUM, text); a folder with a file for each pose; rosbag2 (folder, .mcap, .db3).
 
     Args:
         source: File, folder or bag.

@@ -36,7 +36,7 @@ def perceive(
 
     Args:
         files: Colour image (PNG, JPEG) and depth image (PNG of 16 bits, 0 where nothing was measured, or TIFF of
-            floats); or an organised cloud (.pcd); or a bag (folder or .mcap); or nothing, for a camera of the running
+            floats); or an organised cloud (.pcd); or a bag (folder of rosbag2, .mcap, .db3); or nothing, for a camera of the running
             graph.
         info: Intrinsics of images, with distortion: YAML of a CameraInfo, of OpenCV or Kalibr, JSON, or three rows of
             three numbers. Of a bag or graph: topic of the colour image's CameraInfo.
@@ -54,6 +54,7 @@ def perceive(
         far: Farthest depth that counts, m.
         timeout: Longest wait for a camera of the running graph, s.
     """
+    from openarm_bringup.bags.files import is_recording
     from openarm_common.camera.lens import Lens
     from openarm_common.camera.lens_files import read_lens
     from openarm_common.config import load_config
@@ -69,7 +70,7 @@ def perceive(
         )
     limits = DepthLimits(near=near, far=far)
     cloud = len(files) == 1 and files[0].suffix.lower() == ".pcd"
-    bag = len(files) == 1 and (files[0].is_dir() or files[0].suffix.lower() == ".mcap")
+    bag = len(files) == 1 and (files[0].is_dir() or is_recording(files[0]))
     of_topics = bag or not files
     if not of_topics and (color or depth or camera):
         raise OpenArmError(

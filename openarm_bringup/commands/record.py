@@ -95,7 +95,7 @@ def replay(
     """Publish a bag in place of the robot, in the order and with the quality of service in which it was recorded.
 
     Args:
-        bag: Folder of rosbag2, or an MCAP file.
+        bag: Folder of rosbag2, with metadata.yaml or without, or one file of it: .mcap or .db3.
         rate: Times real time; 0 is as fast as subscribers take it.
         clock: Publish /clock from the stamps of the bag, when it holds none.
         start: Begin this long after the first message, s; latched topics of before are published first.
@@ -147,7 +147,7 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
     A flight recording has none, so its reason and its numbers are shown.
 
     Args:
-        bag: Folder of rosbag2, or an MCAP file.
+        bag: Folder of rosbag2, with metadata.yaml or without, or one file of it: .mcap or .db3.
         golden: File with the numbers that are expected; golden.json in the bag's folder when not given.
         scene: Scene whose table the objects stand on.
         update: Write the numbers instead of comparing.

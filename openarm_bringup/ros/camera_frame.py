@@ -113,7 +113,7 @@ def frame_of_bag(path: Path, chosen: CameraChoice, start_s: float) -> Frame:
     """Return the first frame of a camera in a bag.
 
     Args:
-        path: rosbag2 folder or MCAP file.
+        path: Folder of rosbag2, or a file of it.
         chosen: Which camera.
         start_s: Only from this long after the first message on.
 

@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
+from std_srvs.srv import SetBool
 
 from openarm_bringup.bags.bag import open_bag
 from openarm_bringup.bags.ros.listener import Thinner
@@ -21,6 +24,8 @@ from openarm_bringup.commands.record import replay
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.images import array_to_image
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+from tests.openarm_bringup.mcap_files import Topic, unchunked
+from tests.refusals import refused
 
 
 @pytest.fixture(autouse=True)
@@ -178,9 +183,40 @@ def test_replay_refuses_what_makes_no_sense(ros, tmp_path: Path) -> None:
             replay(tmp_path / "bag", **keywords)
 
 
+def test_topics_that_can_not_be_published_are_left_out_of_a_replay_and_refused_by_name(ros, tmp_path: Path) -> None:
+    """Of a service whose package is installed, events are published; other types, names and encodings are named."""
+    event = serialize_message(SetBool.Event(request=[SetBool.Request(data=True)]))
+    topics = [
+        Topic("/s/_service_event", "std_srvs/srv/SetBool_Event", [(1, event)]),
+        Topic("/other/_service_event", "no_such_srvs/srv/Do_Event", [(2, event)]),
+        Topic("/two words", "std_msgs/msg/String", [(3, serialize_message(String()))]),
+        Topic("/json", "Log", [(4, b"{}")], "json", "jsonschema"),
+    ]
+    path = unchunked(tmp_path / "a.mcap", topics)
+    left = {
+        "/other/_service_event": "the package 'no_such_srvs' is not installed",
+        "/two words": "no name of a topic",
+        "/json": "1 messages of json (jsonschema)",
+    }
+    outcome = replay(path, rate=0.0)
+    assert outcome.success
+    assert outcome.data["messages"] == 1
+    assert outcome.data["left_out"].keys() == left.keys()
+    for topic, why in left.items():
+        assert why in outcome.data["left_out"][topic]
+        assert why in outcome.message
+        refused(re.escape(why), replay, path, topics=(topic,))
+    nothing = replay(unchunked(tmp_path / "b.mcap", topics[1:2]), rate=0.0)
+    assert (nothing.success, nothing.code) == (False, Code.NOTHING_DETECTED)
+    assert left["/other/_service_event"] in nothing.message
+
+
 def test_a_topic_whose_type_has_changed_since_is_left_out_of_a_replay(ros) -> None:
+    changed = "recorded with other fields of openarm_interfaces/msg/GraspStatus"
     with open_bag(Path(__file__).parents[1] / "data" / "demo_pick") as bag:
-        player = Player(bag, ["/grasp/status", "/robot_description"], {}, clock=True)
+        player = Player(bag, None, {}, clock=True)
         player.close()
-    (why,) = player.changed
-    assert why.startswith("/grasp/status was recorded with other fields of openarm_interfaces/msg/GraspStatus")
+        with pytest.raises(OpenArmError, match=changed):
+            Player(bag, ["/grasp/status", "/robot_description"], {}, clock=True)
+    assert list(player.left_out) == ["/grasp/status"]
+    assert changed in player.left_out["/grasp/status"]
