@@ -26,14 +26,14 @@ def interface(name: str) -> Any:
         OpenArmError: INVALID_ARGUMENT, when it is not installed.
     """
     parts = name.split("/")
-    if len(parts) == 3 and parts[1] in _KINDS:
+    if len(parts) == 3 and parts[1] in _KINDS and parts[0].isidentifier():
         try:
-            return getattr(importlib.import_module(f"{parts[0]}.{parts[1]}"), parts[2])
+            known = vars(importlib.import_module(f"{parts[0]}.{parts[1]}"))
         except ModuleNotFoundError:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"the package {parts[0]!r} is not installed") from None
-        except AttributeError:
-            known = vars(importlib.import_module(f"{parts[0]}.{parts[1]}"))
-            raise unknown(f"type in {parts[0]}/{parts[1]}", parts[2], [k for k in known if k[0].isupper()]) from None
+        if not isinstance(known.get(parts[2]), type):
+            raise unknown(f"type in {parts[0]}/{parts[1]}", parts[2], [k for k in known if k[0].isupper()])
+        return known[parts[2]]
     raise OpenArmError(
         Code.INVALID_ARGUMENT, f"{name!r} is not the name of a type; expected package/msg/Name (or srv, action)"
     )

@@ -55,12 +55,17 @@ class Reader:
 # --- bags
 def _bags(folder: Path) -> list[Reader]:
     from rclpy.serialization import serialize_message
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.rosbag2.storage_mcap import zstd
+    from rosbags.typesys import Stores, get_typestore
     from sensor_msgs.msg import JointState
+    from std_srvs.srv import SetBool
 
     from openarm_bringup.bags.bag import BagWriter, open_bag
     from openarm_bringup.bags.ros.listener import from_profile
     from openarm_bringup.bags.ros.messages import messages_of
     from openarm_common.ros.node import QOS_COMMAND
+    from tests.openarm_bringup.mcap_files import Topic, channels, chunk, end, head, messages, unchunked
 
     def read(path: Path) -> None:
         with open_bag(path) as bag:
@@ -77,6 +82,26 @@ def _bags(folder: Path) -> list[Reader]:
                 bag.write("/joint_states", k * 10**7, serialize_message(message))
         sound.append((folder / name / f"{name}.mcap").read_bytes())
     whole = (folder / "packed" / "metadata.yaml").read_bytes()
+    joints = [(k * 10**7, serialize_message(JointState(name=["a"], position=[0.1 * k]))) for k in range(40)]
+    topics = [
+        Topic("/joint_states", "sensor_msgs/msg/JointState", joints),
+        Topic("/json", "Log", [(5, b"{}")] * 9, "json", "jsonschema", b"{}"),
+        Topic("/proto", "Image", [(6, b"\xff")], "protobuf", "protobuf", b"\x0a\xff"),
+        Topic("/s/_service_event", "std_srvs/srv/SetBool_Event", [(7, serialize_message(SetBool.Event()))],
+              text=b"bool data\n---\nbool success\nstring message\n"),
+    ]  # fmt: skip
+    foreign = unchunked(folder / "foreign.mcap", topics).read_bytes()
+    chunked = head() + chunk([channels(topics), *messages(topics)], (0, 10**9)) + end()
+    with Writer(folder / "db", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        types = get_typestore(Stores.ROS2_JAZZY)
+        connection = writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=types)
+        for t_ns, data in joints:
+            writer.write(connection, t_ns, data)
+    database = (folder / "db" / "db.db3").read_bytes()
+
+    def altered_head(data: bytes, rng: random.Random) -> bytes:
+        """Where the tables are defined."""
+        return altered_bytes(data[:4096], rng) + data[4096:]
 
     def cut(data: bytes, rng: random.Random) -> bytes:
         return altered_bytes(data[: rng.randrange(len(data) // 3, len(data))], rng)
@@ -85,10 +110,20 @@ def _bags(folder: Path) -> list[Reader]:
         (path.parent / "packed.mcap").write_bytes(sound[0])
         read(path.parent)
 
+    def parts(path: Path) -> None:
+        (path.parent / "part_1.mcap").write_bytes(foreign)
+        read(path.parent)
+
     return [
         Reader("altered.mcap", tuple(sound), altered_bytes, read),
         Reader("cut.mcap", tuple(sound), cut, read),
         Reader("about/metadata.yaml", (whole,), altered_yaml, about),
+        Reader("foreign.mcap", (foreign, chunked), altered_bytes, read),
+        Reader("cut_foreign.mcap", (foreign, chunked), cut, read),
+        Reader("parts/part_0.mcap", (foreign, sound[0]), altered_bytes, parts),
+        Reader("altered.db3", (database,), altered_bytes, read),
+        Reader("head.db3", (database,), altered_head, read),
+        Reader("any", (b"#ROSBAG V2.0\n", b"PK\x03\x04", b"ply\n", zstd.compress(database)), altered_bytes, read),
     ]
 
 

@@ -216,6 +216,8 @@ class Bag:
             OpenArmError: INVALID_ARGUMENT, when no installed package has the type.
         """
         kind, _ = self.topics[topic]
+        if not hasattr(interface(kind), "get_fields_and_field_types"):
+            return f"{topic} was recorded as {kind}, which is no message"
         for recorded in dict.fromkeys(channel.definition for channel in self._channels[topic]):
             if changed := changed_type(recorded, kind):
                 return f"{topic} was recorded with other fields of {changed} than the installed ones"

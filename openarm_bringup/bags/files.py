@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import re
+import shlex
+import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -30,7 +33,7 @@ _METADATA = "metadata.yaml"
 _NAME = re.compile(r"(?P<stem>.*?)(?:_(?P<number>\d{1,9}))?\.(?P<kind>mcap|db3)(?:\.zstd?)?")
 #: What other files are, by their first bytes, and what to type.
 _OTHERS: Sequence[tuple[bytes, str]] = (
-    (b"#ROSBAG V2", "a bag of ROS 1; convert it: rosbags-convert --src {path} --dst {stem}"),
+    (b"#ROSBAG V2", "a bag of ROS 1; convert it: {convert} --src {path} --dst {stem}"),
     (b"#ROSBAG", "a bag of ROS 1 of an old version; convert it in ROS 1 (rosbag fix), then with rosbags-convert"),
     (b"PK\x03\x04", "a zip archive; unpack it: unzip {path} -d {stem}"),
     (b"\x1f\x8b", "a gzip archive; unpack it: tar xzf {path}, or gunzip -k {path} if it holds one file"),
@@ -108,11 +111,16 @@ def _what(path: Path, first: bytes) -> str:
     """Return what a file is that is no storage of rosbag2, and what to do."""
     if not first:
         return "is empty"
+    names = {
+        "path": shlex.quote(str(path)),
+        "stem": shlex.quote(str(path.with_name(path.name.partition(".")[0]))),
+        "convert": shutil.which("rosbags-convert", path=Path(sys.executable).parent) or "rosbags-convert",
+    }
     for magic, text in _OTHERS:
         if first.startswith(magic):
-            return f"is {text.format(path=path, stem=path.with_name(path.name.partition('.')[0]))}"
+            return f"is {text.format_map(names)}"
     if first[257:262] == b"ustar":
-        return f"is a tar archive; unpack it: tar xf {path}"
+        return f"is a tar archive; unpack it: tar xf {names['path']}"
     name = _NAME.fullmatch(path.name)
     expected = {"mcap": "an MCAP file", "db3": "a database of SQLite"}.get(name["kind"] if name else "")
     if expected:

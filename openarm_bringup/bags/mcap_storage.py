@@ -6,6 +6,7 @@ The summary is used where it is complete. Otherwise the file is read once to fin
 
 from __future__ import annotations
 
+import fcntl
 import os
 import struct
 from collections import Counter
@@ -57,7 +58,8 @@ class _Summary:
 class McapStorage:
     """A file that is open for reading; see `Storage`.
 
-    A file that was cut short is read as far as it is whole; one of chunks gets its end again, where it can be written.
+    A file without its end is read as far as it is whole. One of chunks gets its end again, where it can be written and
+    nobody else writes it.
 
     Args:
         path: File.
@@ -80,11 +82,22 @@ class McapStorage:
             self._size = path.stat().st_size
             closed = mcap.is_closed(path)
             self._open(closed)
-            if not closed and all(part.chunk for part in self._parts) and os.access(path, os.W_OK):
+            if not closed and all(part.chunk for part in self._parts) and self._may_be_written(path):
                 mcap.give_end(path, [(part.start, part.end) for part in self._parts])
         except BaseException:
             self._file.close()
             raise
+
+    def _may_be_written(self, path: Path) -> bool:
+        """Whether the file can be written, and no recorder still writes it: then it grants a lease to a reader."""
+        try:
+            fcntl.fcntl(self._file, fcntl.F_SETLEASE, fcntl.F_RDLCK)
+            fcntl.fcntl(self._file, fcntl.F_SETLEASE, fcntl.F_UNLCK)
+        except BlockingIOError:
+            return False
+        except OSError:  # a file system without leases
+            pass
+        return os.access(path, os.W_OK)
 
     def _open(self, closed: bool) -> None:
         summary = self._summary() if closed else _Summary(self._size)

@@ -122,6 +122,22 @@ def test_a_bag_that_was_cut_short_later_is_distinguished_from_an_unfinished_reco
         assert 100 < sum(bag.counts.values()) < 300
 
 
+def test_a_recording_that_goes_on_is_read_as_far_as_it_is_and_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "bag"
+    with BagWriter(path, {}) as writer:
+        writer.add_topic("/a", "std_msgs/msg/String", from_profile(QOS_COMMAND))
+        for i in range(400):
+            writer.write("/a", i, serialize_message(String(data=f"{i:010}" * 1000)))
+            if i == 300:
+                before = (path / "bag.mcap").read_bytes()
+                with open_bag(path) as bag:
+                    assert len(list(bag.records())) > 200
+                assert (path / "bag.mcap").read_bytes() == before
+    with open_bag(path) as bag:
+        assert bag.mended is None
+        assert len(list(bag.records())) == 400
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [(b"", "is empty"), (b"\x89MCAP0\r\n" + bytes(3), "before anything whole"), (b"nonsense" * 9, "not an MCAP file")],

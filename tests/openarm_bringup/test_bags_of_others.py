@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import io
 import sqlite3
+import struct
 import tarfile
 import time
 import zipfile
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +164,27 @@ def test_databases_that_are_no_recording_or_would_run_something_are_refused(
     assert time.process_time() - began < 2.0
 
 
+def test_a_database_whose_pages_lead_to_each_other_without_end_is_refused(tmp_path: Path) -> None:
+    """Four pages whose 401 entries all are the next page, and a page of messages: 1e11 rows."""
+    path, size = tmp_path / "tree.db3", 4096
+    database = old_database(path, range(3000))
+    (root,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
+    database.close()
+    data = bytearray(path.read_bytes())
+    start = (root - 1) * size
+    places = struct.unpack_from(">5H", data, start + 12)
+    children = [struct.unpack_from(">I", data, start + place)[0] for place in places]
+    for page, following in pairwise([root, *children]):
+        cells = b"".join(struct.pack(">IB", following, k % 120) for k in range(400))
+        head = struct.pack(">BHHHBI", 5, 0, 400, size - len(cells), 0, following)
+        pointers = struct.pack(">400H", *(size - len(cells) + 5 * k for k in range(400)))
+        data[(page - 1) * size : page * size] = (head + pointers).ljust(size - len(cells), b"\0") + cells
+    path.write_bytes(data)
+    began = time.process_time()
+    assert "interrupted" in refusal(path)
+    assert time.process_time() - began < 2.0
+
+
 def test_a_damaged_database_is_refused_with_what_saves_the_rest(tmp_path: Path) -> None:
     old_database(tmp_path / "a.db3", range(2000)).close()
     data = (tmp_path / "a.db3").read_bytes()
@@ -231,6 +254,24 @@ def test_a_topic_of_two_types_is_read_as_what_most_of_it_is(tmp_path: Path) -> N
     with open_bag(unchunked(tmp_path / "a.mcap", [other, strings("/a", [1, 3])])) as bag:
         assert said(bag) == ["/a 1", "/a 3"]
         assert bag.left_out == {"/a": "1 messages of std_msgs/msg/Bool"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "match"),
+    [
+        ("std_srvs/srv/SetBool", "is no message"),
+        ("std_msgs/msg/__name__", "__name__"),
+        (".x/msg/A", "not the name of a type"),
+        ("std_msgs/msg/Strin", "did you mean"),
+        ("no_such_msgs/msg/A", "the package 'no_such_msgs' is not installed"),
+        ("a/b/c/d", "not the name of a type"),
+    ],
+)
+def test_types_that_are_no_installed_messages_say_why(tmp_path: Path, kind: str, match: str) -> None:
+    path = unchunked(tmp_path / "a.mcap", [strings("/a", [1], kind)])
+    refused(match, replay, path, topics=("/a",))
+    with open_bag(path) as bag:
+        assert sum(1 for _ in bag.records()) == 1
 
 
 def test_a_type_that_changed_within_a_recording_is_named(tmp_path: Path) -> None:
@@ -342,7 +383,7 @@ def test_a_bag_of_ros_1_says_how_to_convert_it_in_every_command(tmp_path: Path) 
         types = get_typestore(Stores.ROS1_NOETIC)
         writer.write(writer.add_connection("/a", STRING, typestore=types), 1, b"\x01\0\0\0x")
     path = tmp_path / "old.bag"
-    match = rf"is a bag of ROS 1; convert it: rosbags-convert --src {path} --dst {tmp_path / 'old'}$"
+    match = rf"is a bag of ROS 1; convert it: \S*rosbags-convert --src {path} --dst {tmp_path / 'old'}$"
     for call in (perceive, replay, lambda given: opened(given, ALL_SAMPLES)):
         refused(match, call, path)
 
