@@ -24,7 +24,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from openarm_bringup.bags.definitions import changed_type, definition, event_definition, is_event, nested_types
 from openarm_bringup.bags.files import ZSTD, find, open_storage
 from openarm_bringup.bags.mcap import unpack
-from openarm_bringup.bags.mcap_storage import McapStorage
 from openarm_bringup.bags.storage import DAMAGE, Channel, Storage, merged
 from openarm_bringup.messages import interface
 from openarm_common.errors import Code, OpenArmError, said
@@ -187,7 +186,7 @@ class Bag:
         self.path = path
         self._files = files
         self.custom = custom
-        lost = [file.given_up for file in files if isinstance(file, McapStorage) and file.given_up is not None]
+        lost = [file.given_up for file in files if file.given_up is not None]
         self.mended = sum(lost) if lost else None
         by_topic: defaultdict[str, list[Channel]] = defaultdict(list[Channel])
         for channel in (channel for file in files for channel in file.channels):
@@ -201,7 +200,8 @@ class Bag:
             ours = {channel.type for channel in channels if not channel.encoding}
             if kind := max(ours, key=lambda one: (counts[one], one), default=""):
                 self._channels[topic] = [c for c in channels if not c.encoding and c.type == kind]
-            if others := [f"{count} messages of {what}" for what, count in counts.items() if what != kind]:
+            others = [f"{n} message{'s' * (n != 1)} of {what}" for what, n in counts.items() if what != kind]
+            if others:
                 self.left_out[topic] = ", ".join(others)
         self.topics = {topic: (some[0].type, _strongest(some)) for topic, some in self._channels.items()}
         self.counts = {topic: sum(channel.count for channel in some) for topic, some in self._channels.items()}
@@ -285,8 +285,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
         except OpenArmError as error:
             if not bag.left_out or error.code not in _MISSING:
                 raise
-            text = f"{error.message}; left out of {path}, which nothing here can read: {listed(bag.left_out)}"
-            raise OpenArmError(error.code, text) from error
+            raise OpenArmError(error.code, f"{error.message}; left out of {path}: {listed(bag.left_out)}") from error
 
 
 def listed(reasons: Mapping[str, str]) -> str:

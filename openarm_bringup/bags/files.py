@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -61,10 +62,12 @@ class Found:
 
 def is_recording(path: Path) -> bool:
     """Whether a file is a recording by its name or its first bytes, of ROS 1 too, or a folder has such a file."""
+    named = _is_part(path.name) or path.suffix == ".bag"
+    if named or not os.access(path, os.R_OK):
+        return named
     if path.is_dir():
         return any(_is_part(file.name) for file in path.iterdir())
-    magics = (mcap.MAGIC, sqlite_storage.MAGIC, ZSTD, b"#ROSBAG")
-    return _is_part(path.name) or path.suffix == ".bag" or (path.is_file() and _first(path).startswith(magics))
+    return path.is_file() and _first(path).startswith((mcap.MAGIC, sqlite_storage.MAGIC, ZSTD, b"#ROSBAG"))
 
 
 def find(path: Path, stack: ExitStack) -> Found:
@@ -82,8 +85,10 @@ def find(path: Path, stack: ExitStack) -> Found:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no bag at {path}")
     if path.name == _METADATA:
         path = path.parent
-    if not path.is_dir():
+    if path.is_file():
         return Found([_unpacked(path, stack)])
+    if not path.is_dir():
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} is neither a file nor a folder")
     found = _described(path) if _is_filled(path / _METADATA) else Found(_one_recording(path))
     return Found([_unpacked(file, stack) for file in found.files], found.custom)
 
@@ -145,10 +150,11 @@ def _described(folder: Path) -> Found:
             f"{about} lists no files ({said(error)}); move it away to read the files of the folder without it",
         ) from error
     names = [PureWindowsPath(PurePosixPath(str(name)).name).name for name in listed]
-    there = {file.name: file for file in folder.iterdir()}
-    files = [there.get(name) or there.get(name.removesuffix(".zstd").removesuffix(".zst")) for name in names]
-    missing = [name for name, file in zip(names, files, strict=True) if file is None]
-    if missing and len(missing) == len(names):
+    there = {file.name: file for file in folder.iterdir() if file.is_file()}
+    found = {name: there.get(name) or there.get(name.removesuffix(".zstd").removesuffix(".zst")) for name in names}
+    files = [file for file in found.values() if file is not None]
+    missing = [name for name, file in found.items() if file is None]
+    if not files and any(map(_NAME.fullmatch, there)):
         return Found(_one_recording(folder), custom_in(document))  # renamed
     if missing:
         raise OpenArmError(
@@ -157,13 +163,13 @@ def _described(folder: Path) -> Found:
             f"or move {_METADATA} away to read the files that are there",
         )
     for file in files:
-        if file and file.suffix == ".mcap" and not mcap.is_closed(file):
+        if file.suffix == ".mcap" and not mcap.is_closed(file):
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,
                 f"{file} was cut short after it had been recorded; copy the bag again, or open this file by itself: "
                 "all that is whole in it is kept",
             )
-    return Found([file for file in files if file], custom_in(document))
+    return Found(files, custom_in(document))
 
 
 def _one_recording(folder: Path) -> list[Path]:
@@ -172,14 +178,15 @@ def _one_recording(folder: Path) -> list[Path]:
     Raises:
         OpenArmError: INVALID_ARGUMENT, when there is none, or when the files are not numbered as parts of one.
     """
-    named = {file: match for file in sorted(folder.iterdir()) if (match := _NAME.fullmatch(file.name))}
+    entries = sorted(folder.iterdir())
+    named = {file: match for file in entries if (match := _NAME.fullmatch(file.name)) and file.is_file()}
     files = sorted(named, key=lambda file: (named[file]["stem"], int(named[file]["number"] or 0)))
     if len(files) == 1:
         return files
     if not files:
-        inner = [one.name for one in sorted(folder.iterdir()) if one.is_dir() and is_recording(one)]
-        entries = ", ".join(one.name for one in sorted(folder.iterdir())[:5]) or "nothing"
-        there = f"bags in it: {', '.join(inner[:5])}; name one of them" if inner else f"found {entries}"
+        inner = [one.name for one in entries if one.is_dir() and is_recording(one)]
+        found = ", ".join(one.name for one in entries[:5]) or "nothing"
+        there = f"bags in it: {', '.join(inner[:5])}; name one of them" if inner else f"found {found}"
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"{folder} is not a bag: expected {_METADATA}, or files .mcap or .db3; {there}"
         )

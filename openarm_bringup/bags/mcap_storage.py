@@ -64,9 +64,6 @@ class McapStorage:
     Args:
         path: File.
 
-    Attributes:
-        given_up: Bytes after the last whole record; None for a file that has its end.
-
     Raises:
         ReaderError: And others of `DAMAGE`, for content that is no MCAP.
         OSError: When the file can't be read.

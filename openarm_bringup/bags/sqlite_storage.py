@@ -35,7 +35,7 @@ class SqliteStorage:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.given_up: int | None = None
         self._steps = 0
         logs = (path.with_name(path.name + suffix) for suffix in ("-wal", "-journal"))
         logged = sum(log.stat().st_size for log in logs if log.exists())

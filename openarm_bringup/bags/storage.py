@@ -73,9 +73,11 @@ class Storage(Protocol):
         start_ns: Stamp of the first message.
         end_ns: Stamp of the last message; before `start_ns` where there is none.
         custom: What was kept with the recording, where the file says it.
+        given_up: Bytes after the last whole record; None for a file that was closed in order.
     """
 
     channels: list[Channel]
+    given_up: int | None
     start_ns: int
     end_ns: int
     custom: Mapping[str, str]

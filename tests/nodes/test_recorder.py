@@ -196,7 +196,7 @@ def test_topics_that_can_not_be_published_are_left_out_of_a_replay_and_refused_b
     left = {
         "/other/_service_event": "the package 'no_such_srvs' is not installed",
         "/two words": "no name of a topic",
-        "/json": "1 messages of json (jsonschema)",
+        "/json": "1 message of json (jsonschema)",
     }
     outcome = replay(path, rate=0.0)
     assert outcome.success

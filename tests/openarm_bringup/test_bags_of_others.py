@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import os
 import sqlite3
 import struct
 import tarfile
@@ -199,8 +200,8 @@ def test_channels_of_other_encodings_are_left_out_and_named(tmp_path: Path) -> N
         assert said(bag) == ["/a 1", "/a 7"]
         assert bag.left_out == {
             "/json": "2 messages of json (jsonschema)",
-            "/proto": "1 messages of protobuf (protobuf)",
-            "/ros1": "1 messages of ros1 (ros1msg)",
+            "/proto": "1 message of protobuf (protobuf)",
+            "/ros1": "1 message of ros1 (ros1msg)",
             "/flat": "3 messages of flatbuffer (flatbuffer)",
             "/plain": "0 messages of json (no schema)",
         }
@@ -212,7 +213,7 @@ def test_channels_of_other_encodings_are_left_out_and_named(tmp_path: Path) -> N
 
 def test_a_file_without_any_message_of_ros_2_is_refused_with_what_is_in_it(tmp_path: Path) -> None:
     text = refusal(unchunked(tmp_path / "foreign.mcap", FOREIGN))
-    assert "has no messages of ROS 2: /json: 2 messages of json (jsonschema); /proto: 1 messages of protobuf" in text
+    assert "has no messages of ROS 2: /json: 2 messages of json (jsonschema); /proto: 1 message of protobuf" in text
     assert "ros2 bag record" in text
 
 
@@ -253,7 +254,7 @@ def test_a_topic_of_two_types_is_read_as_what_most_of_it_is(tmp_path: Path) -> N
     other = Topic("/a", "std_msgs/msg/Bool", [(2, b"\0\1\0\0\1")], text=b"bool data\n")
     with open_bag(unchunked(tmp_path / "a.mcap", [other, strings("/a", [1, 3])])) as bag:
         assert said(bag) == ["/a 1", "/a 3"]
-        assert bag.left_out == {"/a": "1 messages of std_msgs/msg/Bool"}
+        assert bag.left_out == {"/a": "1 message of std_msgs/msg/Bool"}
 
 
 @pytest.mark.parametrize(
@@ -375,6 +376,18 @@ def test_metadata_without_files_and_files_that_are_missing_say_what_to_do(tmp_pa
     document["rosbag2_bagfile_information"]["relative_file_paths"] = ["bag.mcap", "bag_1.mcap"]
     (folder / "metadata.yaml").write_text(yaml.safe_dump(document))
     assert "lacks bag_1.mcap, which metadata.yaml lists; copy the bag again, or move" in refusal(folder)
+    (folder / "metadata.yaml").write_text(whole)
+    (folder / "bag.mcap").rename(folder / "renamed.mcap")
+    with open_bag(folder) as bag:
+        assert len(said(bag)) == 3
+    (folder / "renamed.mcap").unlink()
+    assert "lacks bag.mcap" in refusal(folder)
+
+
+def test_what_is_neither_file_nor_folder_is_refused_without_waiting(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    assert "neither a file nor a folder" in refusal(tmp_path / "pipe.mcap")
+    assert "found pipe.mcap" in refusal(tmp_path)
 
 
 # --- what is no bag of ROS 2
