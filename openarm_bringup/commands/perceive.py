@@ -36,8 +36,8 @@ def perceive(
 
     Args:
         files: Colour image (PNG, JPEG) and depth image (PNG of 16 bits, 0 where nothing was measured, or TIFF of
-            floats); or an organised cloud (.pcd); or a bag (folder of rosbag2, .mcap, .db3); or nothing, for a camera of the running
-            graph.
+            floats); or an organised cloud (.pcd); or a bag (folder of rosbag2, .mcap, .db3); or nothing, for a camera
+            of the running graph.
         info: Intrinsics of images, with distortion: YAML of a CameraInfo, of OpenCV or Kalibr, JSON, or three rows of
             three numbers. Of a bag or graph: topic of the colour image's CameraInfo.
         color: Topic of the colour image in a bag or graph, also compressed; by the names of drivers when not given.
