@@ -31,7 +31,8 @@ from openarm_evaluation.detector.data import DataConfig, make_data
 from openarm_evaluation.detector.training.report import LEAST, evaluate
 from openarm_evaluation.detector.training.samples import Samples
 from openarm_evaluation.detector.training.scores import Scores, score
-from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
+from openarm_perception.detection.boxes import Candidates, Letterbox, blob
+from openarm_perception.detection.layouts import decode
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
 
 MODELS = {"320": "shapes_320x256", "640": "shapes_640x480"}

@@ -2,7 +2,8 @@
 """From an image to the input of a network and from its output back to boxes in the image.
 
 Boxes are left, top, right, bottom in pixels of which each covers one unit: a box around the single pixel (u, v) is
-u, v, u + 1, v + 1. Images keep their proportions: they are scaled to fit the input, the rest is filled.
+u, v, u + 1, v + 1. Images keep their proportions: they are scaled to fit the input, the rest is filled; networks that
+learnt from stretched images get those.
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ class Letterbox:
     scale: tuple[float, float]
 
     @classmethod
-    def fit(cls, image: tuple[int, int], size: tuple[int, int]) -> Letterbox:
-        """Fit an image (width, height) in an input (width, height)."""
+    def fit(cls, image: tuple[int, int], size: tuple[int, int], *, stretched: bool = False) -> Letterbox:
+        """Fit an image (width, height) in an input (width, height), or stretch it to fill that."""
         scale = min(size[0] / image[0], size[1] / image[1])
-        inner = (max(1, round(image[0] * scale)), max(1, round(image[1] * scale)))
+        inner = size if stretched else (max(1, round(image[0] * scale)), max(1, round(image[1] * scale)))
         exact = (inner[0] / image[0], inner[1] / image[1])
         return cls(*size, (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2, inner, exact)
 
@@ -83,33 +84,26 @@ class Candidates:
     boxes: Array
 
 
-def decode(output: NDArray[np.float32], threshold: float, max_overlap: float, limit: int = 100) -> Candidates:
-    """Return boxes of a network's output without the weaker ones of the same object.
+def suppress(found: Candidates, max_overlap: float, limit: int = 100) -> Candidates:
+    """Return boxes without the weaker ones of the same object.
 
     Args:
-        output: (4 + classes, n): cx, cy, width, height in pixels, then a score per class.
-        threshold: Least score.
+        found: Best first.
         max_overlap: Of the same class, what overlaps a better box by more (intersection over union) is dropped; of
             another class, what overlaps halfway from there to 1.
         limit: Most boxes.
     """
-    scores = output[4:].max(axis=0)
-    cells = np.nonzero(scores >= threshold)[0]
-    cells = cells[np.argsort(-scores[cells], kind="stable")][: 20 * limit]
-    found = output[:, cells].astype(np.float64)
-    classes, best = found[4:].argmax(axis=0), scores[cells].astype(np.float64)
-    boxes = np.concatenate([found[:2] - found[2:4] / 2.0, found[:2] + found[2:4] / 2.0]).T
-    left = np.ones(len(cells), np.bool_)
+    left = np.ones(len(found.scores), np.bool_)
     kept: list[int] = []
-    for i in range(len(cells)):
+    for i in range(len(left)):
         if not left[i]:
             continue
         kept.append(i)
         if len(kept) == limit:
             break
-        shared = overlap(boxes[i], boxes)
-        left &= shared <= np.where(classes == classes[i], max_overlap, 0.5 + 0.5 * max_overlap)
-    return Candidates(classes[kept], best[kept], boxes[kept])
+        shared = overlap(found.boxes[i], found.boxes)
+        left &= shared <= np.where(found.classes == found.classes[i], max_overlap, 0.5 + 0.5 * max_overlap)
+    return Candidates(found.classes[kept], found.scores[kept], found.boxes[kept])
 
 
 def overlap(box: Array, others: Array) -> Array:

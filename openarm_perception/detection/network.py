@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """A detector that is a network in an ONNX file, run on the CPU by onnxruntime in one thread.
 
-Any file in the layout of YOLOv8 will do: input (1, 3, h, w) of red, green, blue 0 to 1; output (1, 4 + classes, n) of
-cx, cy, width, height in input pixels and a score per class, 0 to 1. Non-maximum suppression is done here.
+Its input is (1, 3, h, w) of red, green, blue, 0 to 1 (of uint8: 0 to 255). Its output has one of the layouts of
+`layouts`; boxes around masks, key points and turned boxes are used, and the rest of those is not. Non-maximum
+suppression is done here, where the network has done none.
 """
 
 from __future__ import annotations
 
 import ast
 import copy
+import math
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import NoneType
 from typing import Any, cast
 
 import numpy as np
@@ -20,10 +25,11 @@ from pydantic import Field
 from openarm_common.config import Config, RunTimeField, load_yaml
 from openarm_common.detection import KINDS
 from openarm_common.errors import Code, OpenArmError, said
-from openarm_common.printable import brief
+from openarm_common.printable import brief, brief_text
 from openarm_common.resources import is_file, models_dir
-from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
+from openarm_perception.detection.boxes import Candidates, Letterbox, blob, suppress
 from openarm_perception.detection.detector import Detection2D, Image, require_rgb
+from openarm_perception.detection.layouts import END_TO_END, RT_DETR_ROWS, Layout, Table, layout_of
 
 #: Boxes that come this near to the border of the image may be cut by it, pixels.
 _BORDER = 2.0
@@ -31,13 +37,31 @@ _BORDER = 2.0
 _OF_THE_FILE = {"model", "names", "width", "height"}
 #: Longest text of the names of all classes in a file: it takes a hundred times as much memory while it is parsed.
 _MAX_NAMES = 2**16
-_LAYOUT = "expected the layout of YOLOv8: input (1, 3, h, w), output (1, 4 + classes, n)"
+#: Largest number of a class, and largest side of an input, pixels: memory is taken for them.
+_MOST_CLASSES, _LARGEST = 10_000, 4096
+_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
+#: Outputs of DETR and its kin after their choice of the best.
+_LABELLED = {"boxes", "scores", "labels"}
+#: The input of RT-DETR for the (width, height) in which it gives boxes.
+_TARGET = "orig_target_sizes"
+#: Tasks of networks that give boxes, as the metadata names them.
+_TASKS = ("detect", "segment", "pose", "obb")
+_INPUT = "expected one image, channels first: (1, 3, h, w) of float, float16 or uint8"
+_OUTPUT = (
+    "expected (1, 4 + classes, n) as of YOLOv8, (1, n, 6) end to end, (1, n, 4 + classes) as of RT-DETR, (1, n, 5 +"
+    " classes) as of YOLOv5 (not of YOLOX or YOLOv6, which take other images), or boxes, scores and labels;"
+    " `yolo export model=best.pt format=onnx` of Ultralytics writes one"
+)
 
 
 class NetworkConfig(Config):
     """Which network, and what counts as found."""
 
-    model: str = RunTimeField(default="shapes_640x480", description="ONNX file, or a name in models/detector")
+    model: str = RunTimeField(
+        default="shapes_640x480",
+        description="ONNX file of YOLOv5 to YOLO26 or RT-DETR (boxes of the tasks detect, segment, pose, obb), or a"
+        " name in models/detector",
+    )
     names: tuple[str, ...] = RunTimeField(
         default=(), description="of the classes; empty: those of the file, or `names` of the YAML next to it"
     )
@@ -69,9 +93,10 @@ class NetworkDetector:
         self.config = config
         self.path = model_path(config.model)
         self._session = _open(self.path)
-        self._input, self.size = self._check_input()
-        classes = self._check_output()
-        self.names = self._find_names(classes)
+        self._fed, self._type, self.size = self._check_inputs()
+        self.names, self._layout = self._check_outputs()
+        #: Classes of one name are one class: the first.
+        self._kinds = np.array([self.names.index(name) for name in self.names])
         self._wanted: frozenset[int] = frozenset()
         self.set_classes(config.classes)
 
@@ -98,7 +123,7 @@ class NetworkDetector:
         if unknown:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,
-                f"{self.path.name} knows no {', '.join(map(repr, unknown))}; classes: {', '.join(self.names)}",
+                f"{self.path.name} knows no {', '.join(map(repr, unknown))}; classes: {_listed(self.names)}",
             )
         self._wanted = frozenset(self.names.index(name) for name in (names or self.names))
 
@@ -127,69 +152,124 @@ class NetworkDetector:
     def candidates(self, rgb: Image, threshold: float) -> Candidates:
         """Return everything from a score on, boxes in pixels of the image."""
         require_rgb(rgb)
-        letterbox = Letterbox.fit((rgb.shape[1], rgb.shape[0]), self.size)
-        output = self.run(blob(letterbox.place(rgb)))
-        found = decode(output, threshold, self.config.max_overlap)
+        letterbox = Letterbox.fit((rgb.shape[1], rgb.shape[0]), self.size, stretched=self._layout.stretched)
+        image = letterbox.place(rgb)
+        table = self.run(image.transpose(2, 0, 1)[None] if self._type is np.uint8 else blob(image))
+        found = self._found(self._layout, table, self.names, threshold)
+        found = suppress(replace(found, classes=self._kinds[found.classes]), self.config.max_overlap)
         return Candidates(found.classes, found.scores, letterbox.back(found.boxes))
 
-    def run(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Run the network alone: (4 + classes, n) of an input (1, 3, h, w)."""
-        return cast(NDArray[np.float32], self._session.run(None, {self._input: image})[0])[0]
+    def run(self, image: NDArray[Any]) -> Table:
+        """Run the network alone on an input (1, 3, h, w): (channels, n) of its output, as `layouts` has it."""
+        return self._layout.table(self._main(self._outputs(image)))
+
+    def _outputs(self, image: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        name, *others = self._fed
+        fed = {name: image.astype(self._type, copy=False), **dict.fromkeys(others, np.array([self.size]))}
+        try:
+            outputs = self._session.run(None, fed)
+            return {item.name: np.asarray(out) for item, out in zip(self._session.get_outputs(), outputs, strict=True)}
+        # onnxruntime raises types of its own, which it does not document
+        except Exception as error:
+            raise self._wrong(f"it does not run on a {self.size[0]}x{self.size[1]} image: {said(error)}") from error
+
+    def _main(self, outputs: Mapping[str, NDArray[Any]]) -> NDArray[np.floating]:
+        """Return the output (a, b) that has boxes, scores and classes."""
+        main = next(iter(outputs.values()), np.empty(0))
+        if outputs.keys() >= _LABELLED:
+            boxes, scores, labels = outputs["boxes"], outputs["scores"], outputs["labels"]
+            if boxes.size == 4 * scores.size == 4 * labels.size:
+                main = np.concatenate([boxes.reshape(-1, 4), np.c_[scores.ravel(), labels.ravel()]], axis=1)[None]
+        if main.ndim != 3 or len(main) != 1 or main.dtype.kind not in "fiu":
+            raise self._unread(outputs)
+        return main[0]
+
+    def _found(self, layout: Layout, table: Table, names: Sequence[str], threshold: float) -> Candidates:
+        found = layout.found(table, len(names), threshold, self.size)
+        if not np.isfinite(found.boxes).all() or not np.isfinite(found.scores).all():
+            raise self._wrong("its output has values that are no finite numbers; export it again, in float32")
+        if strange := set(found.classes.tolist()) - set(range(len(names))):
+            raise self._wrong(
+                f"it finds class {min(strange)}, but only 0 to {len(names) - 1} have names ({_listed(names)}): give"
+                " all names in the parameter network.names, '[a, b, …]'"
+            )
+        return found
 
     # --- contents of the file
-    def _check_input(self) -> tuple[str, tuple[int, int]]:
+    def _check_inputs(self) -> tuple[list[str], Any, tuple[int, int]]:
+        """Return the names of the inputs, the type of the first, and its (width, height)."""
         inputs = self._session.get_inputs()
-        shape: list[Any] = list(inputs[0].shape)
-        if len(inputs) != 1 or len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
+        shape: list[Any] = list(inputs[0].shape) if inputs else []
+        kind = _TYPES.get(inputs[0].type) if inputs else None
+        others = [item.name for item in inputs[1:]]
+        if kind is None or len(shape) != 4 or shape[1] != 3 or others not in ([], [_TARGET]):
             found = "; ".join(f"{item.name} {item.shape} {item.type}" for item in inputs)
-            raise self._wrong(f"its input is {found}, of tensor(float); {_LAYOUT}")
-        if shape[0] not in (1, None) and not isinstance(shape[0], str):
-            raise self._wrong(f"it takes {shape[0]} images at a time, expected one; export it with a batch of 1")
+            raise self._wrong(f"its input is {found or 'missing'}; {_INPUT}")
+        if isinstance(shape[0], int) and shape[0] != 1:
+            raise self._wrong(f"it takes {shape[0]} images at a time, expected one; export it with batch=1")
         height, width = (
             size if isinstance(size, int) else free
             for size, free in zip(shape[2:], (self.config.height, self.config.width), strict=True)
         )
-        return inputs[0].name, (width, height)
+        if not (0 < width <= _LARGEST and 0 < height <= _LARGEST):
+            raise self._wrong(f"its input is {width}x{height} pixels, expected at most {_LARGEST}x{_LARGEST}")
+        return [inputs[0].name, *others], kind, (width, height)
 
-    def _check_output(self) -> int:
-        """Return the number of classes, by the shape of what a grey image gives."""
-        image = np.full((1, 3, self.size[1], self.size[0]), 0.5, np.float32)
+    def _check_outputs(self) -> tuple[tuple[str, ...], Layout]:
+        """Return the names of the classes and the layout, by what the network says of a grey image."""
+        grey = 127 if self._type is np.uint8 else 0.5
+        outputs = self._outputs(np.full((1, 3, self.size[1], self.size[0]), grey, self._type))
+        main, metadata = self._main(outputs), self._metadata()
+        if not np.isfinite(main).all():
+            raise self._wrong("its output has values that are no finite numbers; export it again, in float32")
+        extras = _extras(metadata, outputs)
+        count = main.shape[0] - 4 - extras[0]
+        many = 0 < count < main.shape[1]
+        names, where = self._find_names(metadata, f"{count} classes" if many else "classes")
+        layouts = (layout_of(main, len(names), extra, self.size) for extra in extras)
+        layout = END_TO_END if outputs.keys() >= _LABELLED else next(filter(None, layouts), None)
+        if layout is None:
+            if many:
+                raise self._wrong(f"it has {count} classes, but {where} names {len(names)}: {_listed(names)}")
+            raise self._unread(outputs, f", and {where} names {len(names)} classes")
+        if metadata.get("task") == "obb":
+            layout = replace(layout, turned=True, corners=False)
+        elif metadata.get("head") == "RTDETRDecoder" and layout is END_TO_END:
+            layout = RT_DETR_ROWS
+        elif len(self._fed) > 1:
+            layout = replace(layout, stretched=True)
+        found = self._found(layout, layout.table(main), names, -np.inf)
+        low, high = found.scores.min(initial=0.0), found.scores.max(initial=0.0)
+        if low < -1e-3 or high > 1.0 + 1e-3:
+            text = f"its scores go from {low:.3g} to {high:.3g}, expected 0 to 1; export it with its sigmoid"
+            raise self._wrong(text)
+        return names, layout
+
+    def _metadata(self) -> dict[str, str]:
         try:
-            outputs = self._session.run(None, {self._input: image})
-        # onnxruntime raises types of its own, which it does not document
-        except Exception as error:
-            raise self._wrong(f"it does not run on a {self.size[0]}x{self.size[1]} image: {said(error)}") from error
-        first = np.asarray(outputs[0])
-        if first.ndim != 3 or first.shape[0] != 1 or first.shape[1] < 5 or first.shape[1] > first.shape[2]:
-            hint = ""
-            if first.ndim == 3 and first.shape[1] > first.shape[2] >= 5:
-                hint = "; that is the layout of YOLOv5, or a file exported with its own non-maximum suppression"
-            raise self._wrong(f"its output has shape {first.shape}{hint}; {_LAYOUT}")
-        scores = first[0, 4:]
-        if not np.isfinite(first).all() or scores.min() < -1e-3 or scores.max() > 1.0 + 1e-3:
-            raise self._wrong(
-                f"its scores go from {scores.min():.3g} to {scores.max():.3g}, expected 0 to 1; export it with"
-                " its sigmoid"
-            )
-        return int(first.shape[1]) - 4
+            return dict(self._session.get_modelmeta().custom_metadata_map)
+        except UnicodeDecodeError as error:
+            raise self._wrong(f"its metadata are no text: {said(error)}") from error
 
-    def _find_names(self, classes: int) -> tuple[str, ...]:
+    def _find_names(self, metadata: Mapping[str, str], classes: str) -> tuple[tuple[str, ...], str]:
+        """Return the names of the classes, and where they come from."""
         if self.config.names:
-            names, where = self.config.names, "the parameter names"
-        else:
-            try:
-                metadata = dict(self._session.get_modelmeta().custom_metadata_map)
-            except UnicodeDecodeError as error:
-                raise self._wrong(f"its metadata are no text: {said(error)}") from error
-            names, where = _names_of(self.path, metadata)
+            return self.config.names, "the parameter network.names"
+        names, where = _names_of(self.path, metadata)
         if not names:
             raise self._wrong(
-                f"its {classes} classes have no names: give them in the parameter names, or in"
+                f"its {classes} have no names: give them in the parameter network.names, '[a, b, …]', or in"
                 f" {self.path.with_suffix('.yaml').name} next to it (names: [a, b, …])"
             )
-        if len(names) != classes:
-            raise self._wrong(f"it has {classes} classes, but {where} names {len(names)}: {', '.join(names)}")
-        return names
+        return names, where
+
+    def _unread(self, outputs: Mapping[str, NDArray[Any]], more: str = "") -> OpenArmError:
+        """Return what to say of outputs that have none of the layouts."""
+        task = self._metadata().get("task", "detect")
+        if task not in _TASKS:
+            return self._wrong(f"its task is {brief(task)}, which gives no boxes; expected one of {', '.join(_TASKS)}")
+        shapes = ", ".join(f"{name} {out.shape}" for name, out in outputs.items())
+        return self._wrong(f"its output is {brief_text(shapes) or 'missing'}{more}; {_OUTPUT}")
 
     def _wrong(self, text: str) -> OpenArmError:
         return OpenArmError(Code.CONFIG_INVALID, f"network {self.path}: {text}")
@@ -233,9 +313,27 @@ def _open(path: Path) -> Any:
         ) from error
 
 
+def _extras(metadata: Mapping[str, str], outputs: Mapping[str, NDArray[Any]]) -> tuple[int, ...]:
+    """Return how many channels the output may have after scores and classes: for an angle, key points or masks."""
+    task = metadata.get("task")
+    if task == "obb":
+        return (1,)
+    if task == "pose":  # kpt_shape is such as [17, 3]
+        return (math.prod(int(number) for number in re.findall(r"\d{1,4}", metadata.get("kpt_shape", ""))[:2]),)
+    masks = [out.shape[1] for out in list(outputs.values())[1:] if out.ndim == 4]
+    return (*masks[:1], 0)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(dict.fromkeys(names))
+
+
 def _names_of(path: Path, metadata: Mapping[str, str]) -> tuple[tuple[str, ...], str]:
-    """Names of the classes and their source: the metadata of the file (a Python or JSON mapping or list), or a YAML."""
-    if "names" in metadata:
+    """Names of the classes and their source: the metadata of the file (a Python or JSON mapping or list), or a YAML.
+
+    Numbers of a mapping that have no name get one, as class1.
+    """
+    if metadata.get("names"):
         where, text = "its metadata", metadata["names"]
     elif path.with_suffix(".yaml").is_file():
         where, text = path.with_suffix(".yaml").name, ""
@@ -247,9 +345,14 @@ def _names_of(path: Path, metadata: Mapping[str, str]) -> tuple[tuple[str, ...],
             raise ValueError("too long")
         names = ast.literal_eval(text) if text else load_yaml(path.with_suffix(".yaml")).get("names")
         if isinstance(names, dict):
-            by_number = {int(key): value for key, value in cast(dict[Any, Any], names).items()}
-            names = [by_number[key] for key in sorted(by_number)]
-        return tuple(str(name) for name in cast(list[Any], names or [])), where
+            by_number = {int(str(key)): value for key, value in cast(dict[Any, Any], names).items()}
+            if by_number.keys() - range(_MOST_CLASSES) or len(by_number) < len(names):
+                raise ValueError("no numbers of classes")
+            names = [by_number.get(number, "") for number in range(max(by_number, default=-1) + 1)]
+        if not isinstance(names, list | tuple | NoneType):
+            raise TypeError("no list")
+        listed = cast(list[Any], names or [])
+        return tuple(str(name) or f"class{number}" for number, name in enumerate(listed)), where
     # a text of many brackets is refused by the parser of Python with errors of memory or recursion
     except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
         raise OpenArmError(

@@ -27,25 +27,37 @@ def tensor_type(shape: tuple[int | str, ...], kind: int) -> bytes:
     return field(1, field(1, kind) + field(2, dims))
 
 
+#: Of the type of a tensor.
+KINDS = {np.dtype(np.float32): 1, np.dtype(np.uint8): 2, np.dtype(np.int64): 7, np.dtype(np.float16): 10}
+
+
 def write_network(
     path: Path,
-    output: np.ndarray,
+    output: np.ndarray | dict[str, np.ndarray],
     shape: tuple[int | str, ...] = (1, 3, 256, 320),
     names: str = "{0: 'box', 1: 'ball'}",
     kind: int = 1,
+    metadata: dict[str, str] | None = None,
+    second: str = "",
 ) -> Path:
-    """A file whose output is `output` for every input of `shape` (kind 1: float)."""
-    output = np.ascontiguousarray(output, np.float32)
-    constant = (
-        b"".join(field(1, d) for d in output.shape) + field(2, 1) + field(8, b"always") + field(9, output.tobytes())
-    )
-    node = field(1, b"always") + field(2, b"output0") + field(4, b"Identity")
-    graph = field(1, node) + field(2, b"graph") + field(5, constant)
-    graph += field(11, field(1, b"images") + field(2, tensor_type(shape, kind)))
-    graph += field(12, field(1, b"output0") + field(2, tensor_type(output.shape, 1)))
+    """A file whose output is `output` for every input of `shape` (kind 1: float).
+
+    Several outputs have names, and types of their own; one alone is of floats. A `second` input is two integers.
+    """
+    outputs = output if isinstance(output, dict) else {"output0": np.asarray(output, np.float32)}
+    graph = b""
+    for name, value in outputs.items():
+        data = np.ascontiguousarray(value)
+        head = b"".join(field(1, d) for d in data.shape) + field(2, KINDS[data.dtype])
+        graph += field(1, field(1, b"is_" + name.encode()) + field(2, name.encode()) + field(4, b"Identity"))
+        graph += field(5, head + field(8, b"is_" + name.encode()) + field(9, data.tobytes()))
+        graph += field(12, field(1, name.encode()) + field(2, tensor_type(data.shape, KINDS[data.dtype])))
+    graph += field(2, b"graph") + field(11, field(1, b"images") + field(2, tensor_type(shape, kind)))
+    if second:
+        graph += field(11, field(1, second.encode()) + field(2, tensor_type((1, 2), 7)))
     model = field(1, 8) + field(7, graph) + field(8, field(1, b"") + field(2, 17))
-    if names:
-        model += field(14, field(1, b"names") + field(2, names.encode()))
+    for key, value in {**({"names": names} if names else {}), **(metadata or {})}.items():
+        model += field(14, field(1, key.encode()) + field(2, value.encode()))
     path.write_bytes(model)
     return path
 

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openarm_perception.detection.boxes import Letterbox, blob, decode, overlap
+from openarm_perception.detection.boxes import Letterbox, blob, overlap
+from openarm_perception.detection.layouts import decode
 
 SIZES = ((320, 256), (640, 480), (640, 640), (320, 320))
 

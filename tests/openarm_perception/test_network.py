@@ -96,20 +96,151 @@ def test_names_come_from_the_configuration_the_file_or_a_yaml(tmp_path) -> None:
     refused(r"expected {0: 'a', 1: 'b', …} or a list", make, tmp_path, boxes(), names="box; ball")
 
 
+def test_numbers_of_the_metadata_are_those_of_the_classes_and_one_without_a_name_gets_one(tmp_path) -> None:
+    output = boxes((100, 58, 130, 88, 2, 0.9), (200, 108, 240, 168, 1, 0.6), classes=3)
+    network = make(tmp_path, output, names="{2: 'ball', 0: 'box'}")
+    assert network.names == ("box", "class1", "ball")
+    assert {d.label: d.origin for d in network.detect(IMAGE)} == {"ball": (200, 100), "class1": (400, 200)}
+    words = "it has 2 classes, but its metadata names 3: box, class1, ball"
+    refused(words, make, tmp_path, boxes(), names="{0: 'box', 2: 'ball'}")
+
+
+@pytest.mark.parametrize("classes", [(), ("box",)])
+def test_classes_of_one_name_are_one_class(tmp_path, classes) -> None:
+    """Both are detected, and of two boxes that are as near as those of one object only the better one."""
+    rows = ((100, 58, 130, 88, 0, 0.9), (200, 108, 240, 168, 1, 0.6), (100, 60, 130, 89, 1, 0.8))
+    network = make(tmp_path, boxes(*rows), names="['box', 'box']", config={"classes": classes})
+    assert [(d.label, d.origin) for d in network.detect(IMAGE)] == [("box", (400, 200)), ("box", (200, 100))]
+
+
+#: Two boxes in the image: left, top, right, bottom.
+BOX, BALL = (200, 100, 260, 160), (400, 200, 480, 320)
+SEGMENT, OBB, POSE = {"task": "segment"}, {"task": "obb"}, {"task": "pose", "kpt_shape": "[5, 3]"}
+MASKS = np.zeros((1, 32, 64, 80), np.float32)
+
+
+def fitted(left, top, right, bottom) -> np.ndarray:
+    """A box of the image in the input, which has it at half its size, 8 rows lower: x, y, width, height."""
+    return np.array([(left + right) / 4, (top + bottom) / 4 + 8, (right - left) / 2, (bottom - top) / 2])
+
+
+def stretched(left, top, right, bottom) -> np.ndarray:
+    """A box in shares of the image, which fills the input."""
+    return np.array([(left + right) / 1280, (top + bottom) / 960, (right - left) / 640, (bottom - top) / 480])
+
+
+def shares(*box) -> np.ndarray:
+    return fitted(*box) / (320, 256, 320, 256)
+
+
+def upright(*box) -> np.ndarray:
+    """Of a box that is turned by 90 degrees."""
+    return fitted(*box)[[0, 1, 3, 2]]
+
+
+def corners(*box) -> np.ndarray:
+    x, y, width, height = fitted(*box)
+    return np.array([x - width / 2, y - height / 2, x + width / 2, y + height / 2])
+
+
+def columns(place, *more, first=(), n=100) -> np.ndarray:
+    """(1, n, channels): a score for each class; no more than the first two say something."""
+    rows = [[*place(*BOX), *first, 0.9, 0.2, *more], [*place(*BALL), *first, 0.1, 0.6, *more]]
+    return np.array([rows + [[0.0] * len(rows[0])] * (n - 2)], np.float32)
+
+
+def rows(place, *more, n=300) -> np.ndarray:
+    """(1, n, channels): the best score and its class."""
+    found = [[*place(*BOX), 0.9, 0, *more], [*place(*BALL), 0.6, 1, *more]]
+    return np.array([found + [[0.0] * len(found[0])] * (n - 2)], np.float32)
+
+
+def turned(output: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(output.transpose(0, 2, 1))
+
+
+def labelled() -> dict[str, np.ndarray]:
+    """What RT-DETR's makers export: boxes in pixels of the size that it is given, here that of the input."""
+    scale, found = np.array([320, 256, 320, 256]), rows(stretched, n=2)
+    x, y, w, h = (found[..., :4] * scale).transpose(2, 0, 1)
+    boxes = np.stack([x - w / 2, y - h / 2, x + w / 2, y + h / 2], axis=2)
+    return {"labels": found[..., 5].astype(np.int64), "boxes": boxes.astype(np.float32), "scores": found[..., 4]}
+
+
+#: Outputs that say all the same, and what else the file has.
+READ = {
+    "YOLOv8": (turned(columns(fitted)), {}),
+    "YOLOv8 in shares": (turned(columns(shares)), {}),
+    "YOLOv8 in halves": ({"a": turned(columns(fitted)).astype(np.float16)}, {"kind": 10}),
+    "YOLOv8 of bytes": (turned(columns(fitted)), {"kind": 2}),
+    "YOLOv8 transposed": (columns(fitted), {}),
+    "YOLOv8 and what it came from": ({"a": turned(columns(fitted)), "b": MASKS}, {}),
+    "YOLOv8-seg": ({"a": turned(columns(fitted, *[-3.0] * 32)), "b": MASKS}, {"metadata": SEGMENT}),
+    "YOLOv8-pose": (turned(columns(fitted, *[-3.0] * 15)), {"metadata": POSE}),
+    "YOLOv8-obb": (turned(columns(upright, np.pi / 2)), {"metadata": OBB}),
+    "YOLOv5": (columns(fitted, first=(1.0,), n=5040), {}),
+    "YOLOv5-seg": ({"a": columns(fitted, *[-3.0] * 32, first=(1.0,), n=5040), "b": MASKS}, {}),
+    "end to end": (rows(corners), {"metadata": {"end2end": "True"}}),
+    "end to end, of few": (rows(corners, n=2), {}),
+    "end to end, seg": ({"a": rows(corners, *[-3.0] * 32), "b": MASKS}, {"metadata": SEGMENT}),
+    "end to end, pose": (rows(corners, *[-3.0] * 15), {"metadata": POSE}),
+    "end to end, obb": (rows(upright, np.pi / 2), {"metadata": OBB}),
+    "RT-DETR": (columns(stretched, n=300), {}),
+    "RT-DETR in rows": (rows(stretched), {"metadata": {"head": "RTDETRDecoder"}}),
+    "RT-DETR of its makers": (labelled(), {"second": "orig_target_sizes"}),
+}
+
+
+@pytest.mark.parametrize("layout", READ)
+@pytest.mark.requirement("N-15", "B-38")
+def test_every_layout_gives_the_same_boxes_of_the_same_classes(tmp_path, layout: str) -> None:
+    output, more = READ[layout]
+    found = make(tmp_path, output, **more).detect(IMAGE)
+    assert [d.label for d in found] == ["ball", "box"]
+    assert [d.score for d in found] == pytest.approx([0.6, 0.9], 1e-3)
+    for one, box in zip(found, (BALL, BOX), strict=True):
+        assert (*one.origin, *one.size) == (*box[:2], box[2] - box[0], box[3] - box[1])
+
+
+def test_a_turned_box_becomes_the_box_around_it(tmp_path) -> None:
+    """A square of 40 pixels on its corner is 56.6 wide."""
+    output = np.zeros((1, 7, 100))
+    output[0, :, 0] = (160, 128, 40, 40, 0.9, 0, np.pi / 4)
+    (found,) = make(tmp_path, output, metadata=OBB).detect(IMAGE)
+    assert found.size == (114, 114)
+    assert found.centre == (319.5, 239.5)
+
+
+def test_a_network_that_gives_no_row_for_a_grey_image_is_read(tmp_path) -> None:
+    assert make(tmp_path, np.zeros((1, 0, 6))).detect(IMAGE) == ()
+
+
+#: The answers to queries before the choice of the best, as of DETR.
+QUERIES = {"boxes": np.zeros((1, 3, 4), np.float32), "logits": np.zeros((1, 3, 2), np.float32)}
+
+
 @pytest.mark.parametrize(
     ("output", "kwargs", "words"),
     [
-        (np.zeros((1, 100, 7)), {}, r"output has shape \(1, 100, 7\); that is the layout of YOLOv5"),
-        (np.zeros((1, 300, 6)), {}, "its own non-maximum suppression"),
-        (np.zeros((1, 4, 100)), {}, r"output has shape \(1, 4, 100\); expected the layout of YOLOv8"),
-        (np.zeros((7, 100)), {}, r"output has shape \(7, 100\)"),
-        (np.zeros((2, 7, 100)), {}, r"output has shape \(2, 7, 100\)"),
-        (np.full((1, 6, 100), 3.0), {}, "scores go from 3 to 3, expected 0 to 1; export it with its sigmoid"),
-        (np.full((1, 6, 100), np.nan), {}, "scores go from nan"),
+        (np.zeros((1, 1680, 7)), {}, r"output0 \(1, 1680, 7\).*not of YOLOX or YOLOv6.*`yolo export"),
+        (np.zeros((1, 100, 9)), {}, r"output0 \(1, 100, 9\), and its metadata names 2 classes; expected"),
+        (np.zeros((1, 4, 100)), {}, r"output0 \(1, 4, 100\).*expected \(1, 4 \+ classes, n\) as of YOLOv8"),
+        (np.zeros((7, 100)), {}, r"output0 \(7, 100\)"),
+        (np.zeros((2, 7, 100)), {}, r"output0 \(2, 7, 100\)"),
+        (np.zeros((1, 38, 100)), {}, "it has 34 classes, but its metadata names 2: box, ball"),
+        (np.zeros((1, 1000)), {"metadata": {"task": "classify"}}, "'classify', .* detect, segment, pose, obb"),
+        (np.zeros((1, 6, 100)), {"metadata": {"task": "obb"}}, "it has 1 classes, but its metadata names 2"),
+        (np.zeros((1, 57, 100)), {"metadata": {"task": "pose"}}, "it has 52 classes, but its metadata names 2"),
+        (np.array([[[5, 5, 9, 9, 0.5, 3]]]), {}, r"finds class 3, but only 0 to 1 have names \(box, ball\): give all"),
+        (np.full((1, 6, 100), 3.0), {}, "scores go from 0 to 3, expected 0 to 1; export it with its sigmoid"),
+        (np.full((1, 6, 100), np.nan), {}, "no finite numbers; export it again, in float32"),
+        (QUERIES, {"names": "['a']"}, r"boxes \(1, 3, 4\), logits \(1, 3, 2\), and its metadata names 1"),
         (boxes(), {"shape": (1, 1, 256, 320)}, r"its input is images \[1, 1, 256, 320\]"),
-        (boxes(), {"shape": (1, 256, 320, 3)}, r"\[1, 256, 320, 3\]"),
-        (boxes(), {"shape": (4, 3, 256, 320)}, "it takes 4 images at a time, expected one"),
-        (boxes(), {"kind": 2}, r"tensor\(uint8\), of tensor\(float\)"),
+        (boxes(), {"shape": (1, 256, 320, 3)}, r"\[1, 256, 320, 3\].*channels first"),
+        (boxes(), {"shape": (4, 3, 256, 320)}, "it takes 4 images at a time, expected one; export it with batch=1"),
+        (boxes(), {"shape": (1, 3, 10**6, 320)}, "its input is 320x1000000 pixels, expected at most 4096x4096"),
+        (boxes(), {"kind": 7}, r"tensor\(int64\); expected .* of float, float16 or uint8"),
+        (boxes(), {"second": "scale_factor"}, r"images .*; scale_factor \[1, 2\] tensor\(int64\); expected one image"),
     ],
 )
 @pytest.mark.requirement("N-15")
@@ -161,8 +292,12 @@ def test_other_numbers_do_not_read_the_file_again(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    "names", ["[" * 100_000, "{'x': 'box'}", "5", "(" + "1+" * 20_000 + "1)", f"['{'x' * 100_000}']", "{0: 'box'"]
-)
+    "names",
+    [
+        "{0: 'a', '0': 'b'}", "{10_000_000: 'a'}", "{-1: 'a', 0: 'b'}", "'box'", "{'x': 'box'}", "5", "{0: 'box'",
+        "[" * 100_000, "(" + "1+" * 20_000 + "1)", f"['{'x' * 100_000}']",
+    ],
+)  # fmt: skip
 def test_hostile_names_are_refused_in_a_sentence(tmp_path: Path, names: str) -> None:
     path = write_network(tmp_path / "a.onnx", boxes(), names=names)
     error = refused(r"a\.onnx: its metadata has names", NetworkDetector, NetworkConfig(model=str(path)))

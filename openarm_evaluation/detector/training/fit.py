@@ -21,7 +21,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.detector.training.model import Deployed, Network, grid, loss
 from openarm_evaluation.detector.training.samples import Sample, Samples, vary
 from openarm_evaluation.detector.training.scores import Scores, Truth, score
-from openarm_perception.detection.boxes import Candidates, Letterbox, decode
+from openarm_perception.detection.boxes import Candidates, Letterbox
+from openarm_perception.detection.layouts import decode
 
 #: Sizes (width, height) that weights are exported for and chosen by.
 SIZES = ((320, 256), (640, 480))
