@@ -92,7 +92,7 @@ class NetworkDetector:
     def __init__(self, config: NetworkConfig) -> None:
         self.config = config
         self.path = model_path(config.model)
-        self._session = _open(self.path)
+        self._session, self._metadata = _open(self.path)
         self._fed, self._type, self.size = self._check_inputs()
         self.names, self._layout = self._check_outputs()
         #: Classes of one name are one class: the first.
@@ -219,13 +219,13 @@ class NetworkDetector:
         """Return the names of the classes and the layout, by what the network says of a grey image."""
         grey = 127 if self._type is np.uint8 else 0.5
         outputs = self._outputs(np.full((1, 3, self.size[1], self.size[0]), grey, self._type))
-        main, metadata = self._main(outputs), self._metadata()
+        main, metadata = self._main(outputs), self._metadata
         if not np.isfinite(main).all():
             raise self._wrong("its output has values that are no finite numbers; export it again, in float32")
         extras = _extras(metadata, outputs)
         count = main.shape[0] - 4 - extras[0]
         many = 0 < count < main.shape[1]
-        names, where = self._find_names(metadata, f"{count} classes" if many else "classes")
+        names, where = self._find_names(f"{count} classes" if many else "classes")
         layouts = (layout_of(main, len(names), extra, self.size) for extra in extras)
         layout = END_TO_END if outputs.keys() >= _LABELLED else next(filter(None, layouts), None)
         if layout is None:
@@ -245,17 +245,11 @@ class NetworkDetector:
             raise self._wrong(text)
         return names, layout
 
-    def _metadata(self) -> dict[str, str]:
-        try:
-            return dict(self._session.get_modelmeta().custom_metadata_map)
-        except UnicodeDecodeError as error:
-            raise self._wrong(f"its metadata are no text: {said(error)}") from error
-
-    def _find_names(self, metadata: Mapping[str, str], classes: str) -> tuple[tuple[str, ...], str]:
+    def _find_names(self, classes: str) -> tuple[tuple[str, ...], str]:
         """Return the names of the classes, and where they come from."""
         if self.config.names:
             return self.config.names, "the parameter network.names"
-        names, where = _names_of(self.path, metadata)
+        names, where = _names_of(self.path, self._metadata)
         if not names:
             raise self._wrong(
                 f"its {classes} have no names: give them in the parameter network.names, '[a, b, …]', or in"
@@ -265,7 +259,7 @@ class NetworkDetector:
 
     def _unread(self, outputs: Mapping[str, NDArray[Any]], more: str = "") -> OpenArmError:
         """Return what to say of outputs that have none of the layouts."""
-        task = self._metadata().get("task", "detect")
+        task = self._metadata.get("task", "detect")
         if task not in _TASKS:
             return self._wrong(f"its task is {brief(task)}, which gives no boxes; expected one of {', '.join(_TASKS)}")
         shapes = ", ".join(f"{name} {out.shape}" for name, out in outputs.items())
@@ -291,8 +285,8 @@ def model_path(model: str) -> Path:
     return path
 
 
-def _open(path: Path) -> Any:
-    """Return a session of onnxruntime, imported here alone: detection by colour does not need it."""
+def _open(path: Path) -> tuple[Any, dict[str, str]]:
+    """Return a session of onnxruntime, imported here alone (detection by colour does not need it), and the metadata."""
     try:
         import onnxruntime
     except ImportError as error:
@@ -303,7 +297,11 @@ def _open(path: Path) -> Any:
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # cores are for the other nodes
     options.log_severity_level = 4  # the exception has the reason
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        # by its default it prints a failure, and tries again
+        session = onnxruntime.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)
+        for item in (*session.get_inputs(), *session.get_outputs()):
+            str(item)  # names that are no text fail here
+        return session, dict(session.get_modelmeta().custom_metadata_map)
     # onnxruntime raises types of its own, which it does not document
     except Exception as error:
         raise OpenArmError(

@@ -37,6 +37,7 @@ from openarm_perception.detection.clouds import labelled_cloud
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.detection.draw import annotate
 from openarm_perception.detection.localize import Localizer
+from openarm_perception.detection.network import NetworkConfig, NetworkDetector
 from openarm_perception.detection.pipeline import Perceived, Pipeline, make_pipeline
 from openarm_perception.detection.robot import RobotFinder
 from openarm_perception.geometry.depth import DepthLimits, View
@@ -60,13 +61,11 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         camera = depth_camera(config.camera)
         self._optical_frame = camera.optical_frame
         colors = Path(config.colors) if config.colors else config_dir() / "params" / "detector.yaml"
-        #: Why objects are detected by colour though something else was configured.
-        self._fallback = ""
         limits = DepthLimits(near=camera.near, far=camera.far)
         self._colors = ColorDetector(load_config(colors, ColorDetectorConfig))
         self._localizer = Localizer(config.localizer, limits, config.table_top_z())
         self._watch = CameraWatch(config.watch, limits, camera.intrinsics)
-        self._pipeline = self._first_pipeline()
+        self._pipeline = self._make(config, NetworkConfig())
         self.accept_changes(self._take)
         #: Without depth it is unknown which pixels are the robot.
         cuts = config.self_filter.enabled and bool(config.depth_topic)
@@ -110,7 +109,10 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self.diagnose(True, "idle: no subscribers", **self._counts)
         self.create_service(MeasureTable, "~/measure_table", answering(self._measure_table))
 
-    def _make(self, config: DetectNodeConfig, before: Pipeline | None = None) -> Pipeline:
+    def _make(self, config: DetectNodeConfig, known: NetworkConfig, before: Pipeline | None = None) -> Pipeline:
+        """Make the pipeline; a network that is given is read though another detector is chosen, to refuse it now."""
+        if config.network.model != known.model and config.detector not in ("network", "both"):
+            NetworkDetector(config.network)
         made = make_pipeline(
             config.detector,
             self._colors,
@@ -124,24 +126,9 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         made.faults = config.faults
         return made
 
-    def _first_pipeline(self) -> Pipeline:
-        """Make the configured pipeline; a network that cannot be used leaves the work to the colour detector."""
-        try:
-            return self._make(self.config)
-        except OpenArmError as error:
-            self._fallback = f"; by colour instead of {self.config.detector}: {error.message}"
-            self.get_logger().error(f"{error.message}; objects are detected by colour")
-            return self._make(self.config.model_copy(update={"detector": "color"}))
-
     def _take(self, config: DetectNodeConfig) -> None:
         """Detect as configured from the next frame on."""
-        if all(getattr(config, name) == getattr(self.config, name) for name in ("detector", "network", "tag")):
-            # valid too while colours replace a network that cannot be used
-            self._pipeline.policy, self._pipeline.label = config.policy, config.label
-            self._pipeline.faults = config.faults
-            return
-        self._pipeline = self._make(config, self._pipeline)
-        self._fallback = ""
+        self._pipeline = self._make(config, self.config.network, self._pipeline)
 
     @property
     def waiting_ns(self) -> int | None:
@@ -241,7 +228,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         message += f"; not located: {'; '.join(perceived.refused)}" if perceived.refused else ""
         values: dict[str, object] = {"processing_ms": f"{elapsed_ms:.1f}", "rate_hz": self._rate(), **self._counts}
         values |= self._stream.frames.given_up()
-        values["detector"] = "color" if self._fallback else self.config.detector
+        values["detector"] = self.config.detector
         if self._uncut:
             self._counts["uncut"] += 1
             message += f"; the robot is taken for an object: {self._uncut}"
@@ -253,7 +240,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self.get_logger().error(str(perceived.withheld), throttle_duration_sec=5.0)
         alarm = self._watch.alarm
         values["code"] = Code.OK if alarm is None else alarm.code
-        self.diagnose(not self._fallback and alarm is None, message + self._fallback, **values)
+        self.diagnose(alarm is None, message, **values)
 
     def _rate(self) -> str:
         """Return the frames a second of the wall clock, over the last twenty."""

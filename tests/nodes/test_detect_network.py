@@ -12,11 +12,14 @@ from rclpy.parameter import Parameter
 
 from openarm_bringup.ros.object_client import DetectionListener
 from openarm_common import se3
+from openarm_common.errors import Code
 from openarm_common.ros.convert import pose_to_matrix, stamp_to_ns
 from openarm_common.ros.detections import UNKNOWN, detections_from_msg
 from openarm_common.wanted import select
+from openarm_perception.ros.detector_node import DetectNode
 from tests.nodes.detect_bench import TABLE, TOP, Bench, FakeCamera
 from tests.openarm_perception.onnx_file import boxes, write_network
+from tests.refusals import refuses
 from tests.tag_paint import paint
 
 
@@ -117,21 +120,21 @@ def test_only_another_network_is_read_from_its_file(ros, camera, model) -> None:
     assert "there is no network" in refused.reason
 
 
+@pytest.mark.parametrize("detector", ["color", "network", "both"])
 @pytest.mark.requirement("N-15")
-def test_a_network_that_cannot_be_used_leaves_the_work_to_the_colours_and_the_rest_may_change(
-    ros, camera, tmp_path
-) -> None:
+def test_the_node_does_not_start_with_a_network_that_cannot_be_used(ros, tmp_path, detector: str) -> None:
+    """Of whichever detector; `openarm up` shows why, as of any parameter that is wrong."""
     path = tmp_path / "damaged.onnx"
     path.write_bytes(b"no network")
-    bench = Bench(ros, camera=camera, detector="network", **{"network.model": str(path)})
-    becomes(bench, ["red", "box"])
-    bench.said(f"; by colour instead of network: network {path} (10 bytes) is damaged")
-    status = bench.diagnostics.got[-1].status[0]
-    assert status.level != status.OK
-    assert change(bench, label="blue")[0].successful
-    becomes(bench)
-    assert change(bench, label="red")[0].successful
-    becomes(bench, ["red", "box"])
+    with refuses(Code.CONFIG_INVALID, rf"network {path} \(10 bytes\) is damaged or no ONNX file"):
+        ros.start(DetectNode, detector=detector, **{"network.model": str(path)})
+
+
+def test_a_network_that_is_set_for_later_is_refused_at_once(ros, camera, model) -> None:
+    bench = Bench(ros, camera=camera, **{"network.model": model})
+    (refused,) = change(bench, network__model="nothing.onnx")
+    assert "there is no network 'nothing.onnx'; models: " in refused.reason
+    assert bench.node.config.network.model == model
 
 
 @pytest.mark.requirement("N-16")
