@@ -94,7 +94,8 @@ class NetworkDetector:
         self.path = model_path(config.model)
         self._session, self._metadata = _open(self.path)
         self._fed, self._type, self.size = self._check_inputs()
-        self.names, self._layout = self._check_outputs()
+        self.names, self._layout, table = self._check_outputs()
+        self._check_scores(table)
         #: Classes of one name are one class: the first.
         self._kinds = np.array([self.names.index(name) for name in self.names])
         self._wanted: frozenset[int] = frozenset()
@@ -150,12 +151,16 @@ class NetworkDetector:
         return tuple(sorted(out, key=lambda d: -d.area))
 
     def candidates(self, rgb: Image, threshold: float) -> Candidates:
-        """Return everything from a score on, boxes in pixels of the image."""
+        """Return everything from a score on, boxes in pixels of the image.
+
+        Raises:
+            OpenArmError: BAD_IMAGE, for another shape or type; CONFIG_INVALID, for a class that has no name.
+        """
         require_rgb(rgb)
         letterbox = Letterbox.fit((rgb.shape[1], rgb.shape[0]), self.size, stretched=self._layout.stretched)
         image = letterbox.place(rgb)
         table = self.run(image.transpose(2, 0, 1)[None] if self._type is np.uint8 else blob(image))
-        found = self._found(self._layout, table, self.names, threshold)
+        found = self._found(table, threshold)
         found = suppress(replace(found, classes=self._kinds[found.classes]), self.config.max_overlap)
         return Candidates(found.classes, found.scores, letterbox.back(found.boxes))
 
@@ -184,14 +189,14 @@ class NetworkDetector:
             raise self._unread(outputs)
         return main[0]
 
-    def _found(self, layout: Layout, table: Table, names: Sequence[str], threshold: float) -> Candidates:
-        found = layout.found(table, len(names), threshold, self.size)
+    def _found(self, table: Table, threshold: float) -> Candidates:
+        found = self._layout.found(table, len(self.names), threshold, self.size)
         if not np.isfinite(found.boxes).all() or not np.isfinite(found.scores).all():
             raise self._wrong("its output has values that are no finite numbers; export it again, in float32")
-        if strange := set(found.classes.tolist()) - set(range(len(names))):
+        if strange := set(found.classes.tolist()) - set(range(len(self.names))):
             raise self._wrong(
-                f"it finds class {min(strange)}, but only 0 to {len(names) - 1} have names ({_listed(names)}): give"
-                " all names in the parameter network.names, '[a, b, …]'"
+                f"it finds class {min(strange)}, but only 0 to {len(self.names) - 1} have names"
+                f" ({_listed(self.names)}): give all in the parameter network.names, '[a, b, …]'"
             )
         return found
 
@@ -215,8 +220,8 @@ class NetworkDetector:
             raise self._wrong(f"its input is {width}x{height} pixels, expected at most {_LARGEST}x{_LARGEST}")
         return [inputs[0].name, *others], kind, (width, height)
 
-    def _check_outputs(self) -> tuple[tuple[str, ...], Layout]:
-        """Return the names of the classes and the layout, by what the network says of a grey image."""
+    def _check_outputs(self) -> tuple[tuple[str, ...], Layout, Table]:
+        """Return the names of the classes, the layout, and (channels, n) of a grey image, by which that is known."""
         grey = 127 if self._type is np.uint8 else 0.5
         outputs = self._outputs(np.full((1, 3, self.size[1], self.size[0]), grey, self._type))
         main, metadata = self._main(outputs), self._metadata
@@ -238,12 +243,15 @@ class NetworkDetector:
             layout = RT_DETR_ROWS
         elif len(self._fed) > 1:
             layout = replace(layout, stretched=True)
-        found = self._found(layout, layout.table(main), names, -np.inf)
-        low, high = found.scores.min(initial=0.0), found.scores.max(initial=0.0)
+        return names, layout, layout.table(main)
+
+    def _check_scores(self, table: Table) -> None:
+        scores = self._found(table, -np.inf).scores
+        low, high = scores.min(initial=0.0), scores.max(initial=0.0)
         if low < -1e-3 or high > 1.0 + 1e-3:
-            text = f"its scores go from {low:.3g} to {high:.3g}, expected 0 to 1; export it with its sigmoid"
-            raise self._wrong(text)
-        return names, layout
+            raise self._wrong(
+                f"its scores go from {low:.3g} to {high:.3g}, expected 0 to 1; export it with its sigmoid"
+            )
 
     def _find_names(self, classes: str) -> tuple[tuple[str, ...], str]:
         """Return the names of the classes, and where they come from."""
@@ -261,7 +269,7 @@ class NetworkDetector:
         """Return what to say of outputs that have none of the layouts."""
         task = self._metadata.get("task", "detect")
         if task not in _TASKS:
-            return self._wrong(f"its task is {brief(task)}, which gives no boxes; expected one of {', '.join(_TASKS)}")
+            return self._wrong(f"its task is {brief(task)}, which gives no boxes; export one of {', '.join(_TASKS)}")
         shapes = ", ".join(f"{name} {out.shape}" for name, out in outputs.items())
         return self._wrong(f"its output is {brief_text(shapes) or 'missing'}{more}; {_OUTPUT}")
 
@@ -280,7 +288,9 @@ def model_path(model: str) -> Path:
     if not is_file(path):
         names = ", ".join(sorted(file.stem for file in folder.glob("*.onnx"))) or "none"
         raise OpenArmError(
-            Code.CONFIG_INVALID, f"there is no network {str(path)!r:.300}; models: {names}, or the path of an ONNX file"
+            Code.CONFIG_INVALID,
+            f"there is no network {str(path)!r:.300}; models: {names}, or the path of an ONNX"
+            " file (of best.pt, `yolo export model=best.pt format=onnx` writes it)",
         )
     return path
 

@@ -177,6 +177,7 @@ def test_missing_and_damaged_files_are_refused_by_name(tmp_path) -> None:
     with pytest.raises(OpenArmError, match=r"there is no network .*nowhere\.onnx'; models: ") as caught:
         NetworkDetector(NetworkConfig(model=str(tmp_path / "nowhere.onnx")))
     assert "shapes_640x480" in caught.value.message
+    refused("there is no network .*best.pt.* `yolo export", NetworkDetector, NetworkConfig(model="best.pt"))
     path = write_network(tmp_path / "half.onnx", boxes())
     path.write_bytes(path.read_bytes()[:200])
     with refuses(Code.CONFIG_INVALID, r"half\.onnx \(200 bytes\) is damaged or no ONNX file"):
