@@ -235,7 +235,8 @@ class NetworkDetector:
         layout = END_TO_END if outputs.keys() >= _LABELLED else next(filter(None, layouts), None)
         if layout is None:
             if many:
-                raise self._wrong(f"it has {count} classes, but {where} names {len(names)}: {_listed(names)}")
+                text = f"it has {count} classes, but {where} names {len(names)}: {_listed(names)}"
+                raise self._wrong(f"{text}; give {count} in the parameter network.names, '[a, b, …]'")
             raise self._unread(outputs, f", and {where} names {len(names)} classes")
         if metadata.get("task") == "obb":
             layout = replace(layout, turned=True, corners=False)
