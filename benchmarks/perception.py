@@ -169,7 +169,7 @@ def full_rows(scene: MapScene, pairs: Sequence[Sequence[Frame]], repeats: int) -
     if report.snapshot.states is None:
         raise TypeError("the states were asked for")
     blocks = VoxelBlocks(mapper.lattice)
-    blocks.set_states(report.snapshot.states, np.array([np.nan, -1.0, 1.0], np.float32))
+    blocks.set_layers(0, np.array([np.nan, -1.0, 1.0], np.float32)[report.snapshot.states])
     transform = DistanceTransform(mapper.lattice, FieldConfig().reach)
     robot = SelfFilter(scene.body, FilterConfig())
 

@@ -110,6 +110,9 @@ class OctomapNodeConfig(Config):
     )
     held_topic: str = Field(default="/motion/attached_objects", description="what the hands hold, as markers on links")
     map_file: str = Field(default="", description=".bt or .ot to start from; empty: nothing is known")
+    map_topic: str = Field(
+        default="", description="latched octomap of another program, each of which replaces the map; empty: none"
+    )
     coarse_depths: tuple[int, ...] = Field(default=(15, 14, 13), description="further depths that services answer")
     publish_full: bool = Field(default=True, description="publish octomap_full too")
     autostart: bool = Field(default=True, description="active from the start; false: a lifecycle manager activates it")

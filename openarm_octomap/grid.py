@@ -180,16 +180,17 @@ class OccupancyGrid:
         self.blocks.fill(box, self.config.clamp_min if state == FREE else np.nan)
         return math.prod(s.stop - s.start for s in box)
 
-    def load(self, leaves: Leaves) -> int:
+    def load(self, leaves: Leaves, T_base_tree: Array | None = None) -> int:
         """Replace the map; log-odds are cut to the limits of this map.
+
+        Args:
+            leaves: A tree of cells of any size.
+            T_base_tree: (4, 4) its frame in the base frame; None: it is the base frame.
 
         Returns:
             How many leaves lie outside of the workspace, wholly or in part.
-
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, when the resolutions differ; the map is as it was.
         """
-        outside = leaves.put(self.blocks, self.config.clamp_min, self.config.clamp_max)
+        outside = leaves.put(self.blocks, self.config.clamp_min, self.config.clamp_max, T_base_tree)
         self._never_seen()
         return outside
 

@@ -20,12 +20,12 @@ from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
 from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.blocks import CellSet
-from openarm_common.octree.codec import Payload, encode_states, read_file, write_file
+from openarm_common.octree.codec import TREE_ID, Leaves, Payload, encode_states, read_file, write_file
 from openarm_common.octree.lattice import DEPTH, Lattice
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.self_filter import SelfFilter, Shapes
-from openarm_common.types import Floats
+from openarm_common.types import Array, Floats
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig, UnknownPolicy
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
@@ -107,6 +107,21 @@ class Report:
     reset: int = 0
     ends: int = 0
     outdated: bool = False
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What became of a tree that replaced the map.
+
+    Attributes:
+        nodes: Of the tree.
+        outside: How many of its leaves lie outside of the workspace, wholly or in part.
+        text: A sentence that says so, and what was changed or left out.
+    """
+
+    nodes: int
+    outside: int
+    text: str
 
 
 class Mapper:
@@ -292,26 +307,38 @@ class Mapper:
         blocked = (states == OCCUPIED) | ((states == UNKNOWN) & (unknown == "occupied"))
         return Answer(states, blocked, edge * 2 ** (DEPTH - depth))
 
-    def load(self, path: Path) -> tuple[int, int]:
+    def load(self, path: Path) -> Taken:
         """Replace the map by that of a file.
 
-        Returns:
-            Nodes of its tree, and how many of its leaves lie outside of the workspace.
-
         Raises:
-            OpenArmError: INVALID_ARGUMENT, when the file is damaged, has cells of another size, or says that it is of
+            OpenArmError: INVALID_ARGUMENT, when the file is damaged or of another class of tree, or says that it is of
                 another robot, whose base frame is elsewhere; the map is as it was.
         """
         leaves = read_file(path)
         if leaves.robot not in ("", self._robot):
             text = f"{path} is of robot {leaves.robot[:80]!r}, expected {self._robot!r}"
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}: its cells are in another base frame")
+        return self.take(leaves)
+
+    def take(self, leaves: Leaves, T_base_tree: Array | None = None) -> Taken:
+        """Replace the map by a tree; see `OccupancyGrid.load`.
+
+        Args:
+            leaves: The tree.
+            T_base_tree: (4, 4) its frame in the base frame; None: it is the base frame.
+        """
         with self._lock:
             self._edition += 1
-            try:
-                return leaves.nodes, self._grid.load(leaves)
-            except OpenArmError as error:
-                raise OpenArmError(error.code, f"{path}: {error.message}") from error
+            outside = self._grid.load(leaves, T_base_tree)
+            counts = self._grid.counts()
+        edge = self._grid.lattice.resolution
+        text = f"{leaves.nodes} nodes"
+        if abs(leaves.resolution - edge) > 1e-6 * edge:
+            text += f" of {leaves.resolution:g} m in cells of {edge:g} m"
+        if leaves.tree not in (TREE_ID, "1"):
+            text += f" of a {leaves.tree[:40]}, of which the occupancy alone is taken"
+        text += f"; {counts['occupied']} cells are occupied and {counts['free']} free"
+        return Taken(leaves.nodes, outside, f"{text}; {outside} leaves outside of the workspace")
 
     def _snapshot(self, wanted: Collection[str]) -> Snapshot:
         grid = self._grid

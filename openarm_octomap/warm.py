@@ -39,7 +39,9 @@ def warm() -> None:
         grid.decay(0)
         encode_states(*grid.coarse(15))
         for payload in (grid.binary(), grid.full()):
-            decode(payload.data, grid.lattice.resolution, binary=payload.binary).on(grid.lattice)
+            tree = decode(payload.data, grid.lattice.resolution, binary=payload.binary)
+            tree.on(grid.lattice)
+            _grid().load(tree, _T_BASE_CAMERA)
         grid.clear_box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
 
 

@@ -296,16 +296,31 @@ def expand(rows: Rows, shape: Ints, meaning: NDArray[Any], first: int, out: NDAr
 
 
 @kernel
-def gather(dense: Bytes, shape: Ints, rows: Rows) -> int:
-    """Make blocks of a dense array of codes (8 nx, 8 ny, 8 nz); the block for which a row was missing, or how many."""
+def gather(rows: Rows, palette: Palette, shape: Ints, first: int, values: Floats) -> bool:
+    """Set layers of blocks, as `expand` gives them.
+
+    Args:
+        rows: Changed.
+        palette: Changed.
+        shape: (3,) blocks along each axis.
+        first: Layer of blocks, along x, with which `values` begins.
+        values: (8 layers, ny, nz) log-odds, NaN where unknown.
+
+    Returns:
+        Whether there were rows and room for codes enough; if not, a part is done, and a call with more does all.
+    """
     cells = np.empty(CELLS, np.int32)
-    for block in range(rows.table.size):
-        x, y, z = block // (shape[1] * shape[2]) * EDGE, block // shape[2] % shape[1] * EDGE, block % shape[2] * EDGE
-        for i in range(CELLS):
-            cells[i] = dense[x + compact(i), y + compact(i >> 1), z + compact(i >> 2)]
-        if not store_block(rows, block, cells):
-            return block
-    return rows.table.size
+    for bx in range(values.shape[0] // EDGE):
+        for by in range(shape[1]):
+            for bz in range(shape[2]):
+                for i in range(CELLS):
+                    x, y, z = EDGE * bx + compact(i), EDGE * by + compact(i >> 1), EDGE * bz + compact(i >> 2)
+                    cells[i] = code_of(palette, values[x, y, z])
+                    if cells[i] == FULL:
+                        return False
+                if not store_block(rows, ((first + bx) * shape[1] + by) * shape[2] + bz, cells):
+                    return False
+    return True
 
 
 @kernel

@@ -168,17 +168,9 @@ class VoxelBlocks:
             if done < cells.shape[0]:
                 self.grow()
 
-    def set_states(self, states: Bytes, values: Floats) -> None:
-        """Set all cells.
-
-        Args:
-            states: (nx, ny, nz) index into `values`.
-            values: At most 256 different log-odds, NaN first.
-        """
-        self.clear()
-        for value in values:
-            self.code_of(float(value))
-        self.repeat(lambda: kernels.gather(states, self.shape, self.rows) == self.rows.table.size)
+    def set_layers(self, first: int, values: Floats) -> None:
+        """Set layers of blocks along x from `first` on: log-odds (8 layers, ny, nz), NaN where unknown."""
+        self.repeat(lambda: bool(kernels.gather(self.rows, self.palette, self.shape, first, values)))
 
     def states(self, layers: slice = slice(None)) -> Bytes:
         """Return the states of layers of blocks along x, (8 layers, ny, nz)."""

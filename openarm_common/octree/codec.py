@@ -3,12 +3,16 @@
 
 Two forms. *Binary* has occupied, free and unknown (a reader takes the clamping limits as log-odds); *full* has the
 log-odds of every node. A tree is written pruned, each in the one form that liboctomap has for it, so equal maps give
-equal bytes. Cells are in the frame of the map, see `openarm_common.octree.lattice`.
+give equal bytes. Cells are in the frame of the map, see `openarm_common.octree.lattice`.
+
+Trees of other programs are read for their occupancy: the binary form is the same for every class, and the full form of
+some has more bytes in each node (AbstractOccupancyOcTree.cpp and ColorOcTree.cpp of octomap 1.10).
 """
 
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,8 +26,10 @@ from openarm_common.octree import codec_kernels as kernels
 from openarm_common.octree.block_kernels import EDGE, LEVEL, UNKNOWN
 from openarm_common.octree.blocks import VoxelBlocks
 from openarm_common.octree.lattice import DEPTH, Lattice
+from openarm_common.octree.resample import resampled
+from openarm_common.printable import brief
 from openarm_common.resources import write_whole
-from openarm_common.types import Bytes, Floats, Ints
+from openarm_common.types import Array, Bytes, Floats, Ints
 
 ScalarT = TypeVar("ScalarT", bound=np.generic)
 
@@ -33,6 +39,12 @@ TREE_ID = "OcTree"
 CLAMP_MIN, CLAMP_MAX = -2.0, 3.5
 #: A file that is longer is refused before it is read.
 MAX_FILE_BYTES = 256 * 2**20
+
+#: Bytes that a node of the full form has besides its log-odds, by class of tree: OcTreeStamped writes no times, and "1"
+#: is what OcTree was called once.
+_EXTRA = {TREE_ID: 0, "OcTreeStamped": 0, "1": 0, "ColorOcTree": 3}
+#: Header of the first .bt files: the number 3 (an octree), edge of a cell, nodes.
+_FIRST_HEADER = struct.Struct("<idI")
 
 #: Leaves that are read at a time.
 _PART = 1 << 14
@@ -95,7 +107,7 @@ def encode_states(lattice: Lattice, states: Bytes) -> Payload:
     padded = np.pad(states, pads)
     x, y, z = (k - k % EDGE for k in lattice.key_min)
     blocks = VoxelBlocks(Lattice(lattice.resolution, (x, y, z), padded.shape))
-    blocks.set_states(padded, np.array([np.nan, CLAMP_MIN, CLAMP_MAX], np.float32))
+    blocks.set_layers(0, np.array([np.nan, CLAMP_MIN, CLAMP_MAX], np.float32)[padded])
     return encode_binary(blocks)
 
 
@@ -139,6 +151,7 @@ class Leaves:
         raw: The tree, sound.
         binary: Which form it has.
         nodes: Nodes of the tree, inner ones too.
+        tree: Class of the tree.
         robot: In whose base frame it is; "" where a file does not say it, as those of other programs.
     """
 
@@ -146,11 +159,12 @@ class Leaves:
     raw: Bytes
     binary: bool
     nodes: int
+    tree: str = TREE_ID
     robot: str = ""
 
     def arrays(self) -> tuple[NDArray[np.int32], Floats]:
         """Return (n, 4) level, x, y, z key at that level, and log-odds (n,)."""
-        parts = [(cells.copy(), values.copy()) for cells, values in _Reader(self.raw, self.binary).parts()]
+        parts = [(cells.copy(), values.copy()) for cells, values in self._parts()]
         cells, values = zip(*parts, strict=True) if parts else ([np.empty((0, 4), np.int32)], [np.empty(0, np.float32)])
         return np.concatenate(cells), np.concatenate(values)
 
@@ -160,28 +174,43 @@ class Leaves:
         Raises:
             OpenArmError: INVALID_ARGUMENT, when the resolutions differ.
         """
-        self._require(lattice)
+        if not self._fits(lattice):
+            raise _invalid(f"the map has cells of {self.resolution:g} m, expected {lattice.resolution:g} m")
         out = np.full(lattice.shape, np.nan, np.float32)
         where = (np.array(lattice.key_min, np.int64), np.array(lattice.shape, np.int64))
-        return out, sum(kernels.paint(*part, *where, out) for part in _Reader(self.raw, self.binary).parts())
+        return out, sum(kernels.paint(*part, *where, out) for part in self._parts())
 
-    def put(self, blocks: VoxelBlocks, low: float, high: float) -> int:
-        """Replace cells, log-odds cut to two limits; how many leaves lie outside of the box, wholly or in part.
+    def put(self, blocks: VoxelBlocks, low: float, high: float, T_map_tree: Array | None = None) -> int:
+        """Replace cells; see `openarm_common.octree.resample` for a tree of cells of another size or in another frame.
 
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, when the resolutions differ; the cells are as they were.
+        Args:
+            blocks: Changed.
+            low: Log-odds are cut to this,
+            high: and to this.
+            T_map_tree: (4, 4) frame of the tree in that of the cells; None: they are the same.
+
+        Returns:
+            How many leaves lie outside of the box, wholly or in part.
         """
-        self._require(blocks.lattice)
         blocks.clear()
-        outside, shape, nothing = 0, np.array(blocks.lattice.shape, np.int64), np.empty((0, 0, 0), np.float32)
-        for cells, values in _Reader(self.raw, self.binary).parts():
+        outside, lattice = 0, blocks.lattice
+        if T_map_tree is not None or not self._fits(lattice):
+            T = np.eye(4) if T_map_tree is None else T_map_tree
+            for first, values, number in resampled(self._parts, self.resolution, lattice, T):
+                blocks.set_layers(first, np.clip(values, low, high, out=values))
+                outside += number
+            return outside
+        shape, nothing = np.array(lattice.shape, np.int64), np.empty((0, 0, 0), np.float32)
+        for cells, values in self._parts():
             outside += kernels.paint(cells, values, blocks.key_min, shape, nothing)
             blocks.paint(cells, np.clip(values, low, high))
         return outside
 
-    def _require(self, lattice: Lattice) -> None:
-        if abs(lattice.resolution - self.resolution) > 1e-6 * self.resolution:
-            raise _invalid(f"the map has cells of {self.resolution:g} m, expected {lattice.resolution:g} m")
+    def _fits(self, lattice: Lattice) -> bool:
+        return abs(lattice.resolution - self.resolution) <= 1e-6 * self.resolution
+
+    def _parts(self) -> Iterator[tuple[NDArray[np.int32], Floats]]:
+        return _Reader(self.raw, self.binary, self.tree).parts()
 
 
 class _Reader:
@@ -190,10 +219,11 @@ class _Reader:
     Args:
         raw: The tree.
         binary: Which form it has.
+        tree: Class of the tree.
     """
 
-    def __init__(self, raw: Bytes, binary: bool) -> None:
-        self._raw, self._binary = raw, binary
+    def __init__(self, raw: Bytes, binary: bool, tree: str) -> None:
+        self._raw, self._binary, self._extra = raw, binary, 0 if binary else _EXTRA[tree]
         self._stack = np.zeros((8 * (DEPTH + 1), 4), np.int64)
         self._stack[0, 0] = DEPTH
         self._at = np.array([1, 0, 1], np.int64)
@@ -222,7 +252,7 @@ class _Reader:
             if self._binary:
                 n = kernels.read_states(self._raw, free, occupied, self._stack, self._at, cells, values)
             else:
-                n = kernels.read_values(self._raw, self._stack, self._at, cells, values.view(np.int32))
+                n = kernels.read_values(self._raw, self._extra, self._stack, self._at, cells, values.view(np.int32))
             if n == kernels.TRUNCATED:
                 raise _damaged(f"ends after {self._raw.size} bytes in the middle of the tree")
             if n == kernels.TOO_DEEP:
@@ -230,28 +260,34 @@ class _Reader:
             yield cells[:n], values[:n]
 
 
-def decode(data: Bytes | bytes, resolution: float, *, binary: bool) -> Leaves:
+def decode(data: Bytes | bytes, resolution: float, *, binary: bool, tree: str = TREE_ID) -> Leaves:
     """Read a payload.
 
     Args:
         data: Payload without a file header; empty is the empty map.
         resolution: Edge of a cell, m.
         binary: Which form it has.
+        tree: Class of the tree.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the payload ends too early, goes on after its end, is deeper than 16
-            levels, or holds log-odds that are not finite.
+            levels, or holds log-odds that are not finite, and for the full form of a class that is not known.
     """
+    if not binary and tree not in _EXTRA:
+        raise _invalid(
+            f"tree is of class {brief(tree)}, expected one of {', '.join(_EXTRA)}; the binary form (.bt, writeBinary of"
+            " octomap) is read of any class with occupancy"
+        )
     if not 1e-4 <= resolution <= 100.0:
         raise _invalid(f"res is {resolution} m, expected 0.0001 .. 100")
     raw = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data.view(np.uint8)
-    reader = _Reader(raw, binary)
+    reader = _Reader(raw, binary, tree)
     finite = all([np.isfinite(values).all() for _, values in reader.parts()])  # all parts, that the tree is sound
     if reader.used != raw.size:
         raise _damaged(f"goes on for {raw.size - reader.used} bytes after the tree's end")
     if not finite:
         raise _damaged("holds log-odds that are not finite")
-    return Leaves(resolution, raw, binary, reader.nodes if raw.size else 0)
+    return Leaves(resolution, raw, binary, reader.nodes if raw.size else 0, tree)
 
 
 def write_file(path: Path, payload: Payload, resolution: float, robot: str = "") -> None:
@@ -296,24 +332,40 @@ def read_file(path: Path) -> Leaves:
 
 
 def _parse(content: bytes) -> Leaves:
-    head, found, data = content.partition(b"\ndata\n")
-    lines = head.decode(errors="replace").splitlines() if found else []
-    forms = [suffix for suffix, first in _FIRST_LINE.items() if lines and lines[0].startswith(first)]
-    if not forms:
+    form = next((suffix for suffix, first in _FIRST_LINE.items() if content.startswith(first.encode())), "")
+    head = re.match(rb"(.*?\n)[ \t]*data(?:[ \t\r][^\n]*)?\n", content, re.DOTALL) if form else None
+    if content.startswith(struct.pack("<i", 3)) and len(content) >= _FIRST_HEADER.size:
+        _, resolution, nodes = _FIRST_HEADER.unpack_from(content)
+        leaves, robot = decode(content[_FIRST_HEADER.size :], resolution, binary=True), ""
+    elif head is not None:
+        lines = head[1].decode(errors="replace").splitlines()
+        fields = _fields(lines)
+        try:
+            resolution, nodes = float(fields["res"]), int(fields.get("size", -1))
+        except (KeyError, ValueError) as error:
+            raise _invalid(
+                f"header needs the edge of a cell in metres, a line such as 'res 0.05' above the line 'data': {error}"
+            ) from error
+        tree = fields.get("id", TREE_ID)
+        leaves = decode(content[head.end() :], resolution, binary=form == ".bt", tree=tree)
+        robot = next((line.removeprefix(_ROBOT) for line in lines if line.startswith(_ROBOT)), "")
+    else:
         first = " or ".join(map(repr, _FIRST_LINE.values()))
         raise _invalid(f"not an octree file: expected it to begin with {first} and to have a line 'data'")
-    fields = dict(line.split(None, 1) for line in lines if re.fullmatch(r"[a-z]+\s+\S.*", line))
-    if fields.get("id") != TREE_ID:
-        raise _invalid(f"tree is of class {fields.get('id')!r}, expected {TREE_ID!r}")
-    try:
-        resolution, nodes = float(fields["res"]), int(fields["size"])
-    except (KeyError, ValueError) as error:
-        raise _invalid(f"header needs numbers 'size' and 'res': {error}") from error
-    leaves = decode(data, resolution, binary=forms[0] == ".bt")
-    if leaves.nodes != nodes:
+    if leaves.nodes != nodes and nodes >= 0:
         raise _damaged(f"has {leaves.nodes} nodes, its header says {nodes}")
-    whose = next((line.removeprefix(_ROBOT) for line in lines if line.startswith(_ROBOT)), "")
-    return replace(leaves, robot=whose)
+    return replace(leaves, robot=robot)
+
+
+def _fields(lines: list[str]) -> dict[str, str]:
+    """Return what a header says, in any order; several on a line as octomap reads them."""
+    fields: dict[str, str] = {}
+    for line in lines:
+        words = line.split()
+        while len(words) > 1 and words[0] in ("id", "size", "res"):
+            fields[words[0]] = words[1]
+            words = words[2:]
+    return fields
 
 
 def _damaged(what: str) -> OpenArmError:

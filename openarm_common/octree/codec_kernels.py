@@ -400,11 +400,12 @@ def write_values(
 
 
 @kernel
-def read_values(data: Bytes, stack: Ints, at: Ints, leaves: Keys, bits: Keys) -> int:
-    """Read the next leaves of a tree of five bytes per node; as `read_states`.
+def read_values(data: Bytes, extra: int, stack: Ints, at: Ints, leaves: Keys, bits: Keys) -> int:
+    """Read the next leaves of a tree of five bytes per node and some more; as `read_states`.
 
     Args:
         data: As `write_values` writes it.
+        extra: Bytes between the log-odds of a node and the bits of its children, which are skipped.
         stack: (136, 4).
         at: (3,).
         leaves: (n, 4), filled.
@@ -416,10 +417,10 @@ def read_values(data: Bytes, stack: Ints, at: Ints, leaves: Keys, bits: Keys) ->
     top, used, m = at[0], at[1], 0
     while top > 0 and m < bits.size:
         top -= 1
-        if used + 5 > data.shape[0]:
+        if used + 5 + extra > data.shape[0]:
             return TRUNCATED
         level, x, y, z = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
-        mask = int(data[used + 4])
+        mask = int(data[used + 4 + extra])
         if mask == 0:
             leaves[m, 0], leaves[m, 1], leaves[m, 2], leaves[m, 3] = level, x, y, z
             low, high = np.int32(data[used]) | np.int32(data[used + 1]) << 8, np.int32(data[used + 2])
@@ -428,13 +429,13 @@ def read_values(data: Bytes, stack: Ints, at: Ints, leaves: Keys, bits: Keys) ->
         elif level == 0:
             at[1] = used
             return TOO_DEEP
-        used += 5
+        used += 5 + extra
         for c in range(7, -1, -1):
             if mask >> c & 1:
                 stack[top, 0] = level - 1
                 stack[top, 1], stack[top, 2], stack[top, 3] = 2 * x + (c & 1), 2 * y + ((c >> 1) & 1), 2 * z + (c >> 2)
                 top += 1
-    at[0], at[1], at[2] = top, used, used // 5
+    at[0], at[1], at[2] = top, used, used // (5 + extra)
     return m
 
 

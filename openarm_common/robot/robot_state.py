@@ -91,7 +91,7 @@ class RobotStateBuffer:
         self._states.append(_State(t_ns, tuple(q), q, v if len(v) == len(q) else {}))
 
     def set_static(self, parent: str, child: str, T_parent_child: Array) -> None:
-        """Add or replace a fixed edge; edges of the description itself are ignored.
+        """Add or replace a fixed edge, also one above the root, as of a map; the description's own are ignored.
 
         Args:
             parent: Frame.
@@ -101,6 +101,8 @@ class RobotStateBuffer:
         Raises:
             OpenArmError: INVALID_ARGUMENT, for a name that is none, or when there are too many.
         """
+        if child == self._description.root and self._static.get(parent, (child,))[0] == child:
+            parent, child, T_parent_child = child, parent, se3.inverse(T_parent_child)
         if max(len(parent), len(child)) > LONGEST_NAME or (child not in self._static and len(self._static) >= _FRAMES):
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,

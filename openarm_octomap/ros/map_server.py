@@ -115,9 +115,10 @@ class MapServices:
 
     def _load(self, request: MapFile.Request, response: MapFile.Response) -> str:
         path = file_to_read(request.path, SUFFIXES)
-        response.nodes, response.outside = self._mapper.load(path)
+        taken = self._mapper.load(path)
+        response.nodes, response.outside = taken.nodes, taken.outside
         self._show()
-        return f"{path}: {response.nodes} nodes; {response.outside} leaves outside of the workspace"
+        return f"{path}: {taken.text}"
 
 
 ChoiceT = TypeVar("ChoiceT")

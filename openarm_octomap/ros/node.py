@@ -23,6 +23,7 @@ from openarm_octomap.config import OctomapNodeConfig
 from openarm_octomap.mapper import Frame, Mapper, Report
 from openarm_octomap.ros.map_publisher import MapPublisher
 from openarm_octomap.ros.map_server import MapServices
+from openarm_octomap.ros.map_topic import MapTopic
 from openarm_octomap.ros.sources import Source, cloud_source, depth_source
 
 
@@ -34,7 +35,8 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         config = self.config
         self._mapper = Mapper(self.description, config.grid, config.filter, config.field)
         if config.map_file:
-            self._mapper.load(Path(config.map_file).expanduser())
+            taken = self._mapper.load(Path(config.map_file).expanduser())
+            self.get_logger().info(f"map of {config.map_file}: {taken.text}")
         self._states = RobotStateListener(
             self, self.description, joints=False, depth=100, wait=config.transform_wait, held_topic=config.held_topic
         )
@@ -59,6 +61,9 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         self._field = self._open_field() if config.field.enabled else None
         self._publisher = MapPublisher(self, self.description.base, full=config.publish_full)
         MapServices(self, self._mapper, config.coarse_depths, lambda: self._t_ns, self._show)
+        self._maps = (
+            MapTopic(self, self._mapper, self._states, config.map_topic, self._show) if config.map_topic else None
+        )
         self._timer = self.create_timer(config.period, self._on_timer, clock=self.steady_clock)
         self._timer.cancel()
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
@@ -159,6 +164,9 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         limit = self.config.stale_after
         faults = [self._fault] if self._fault else []
         values: dict[str, object] = {"updates": self._updates, "overruns": self._overruns}
+        if self._maps is not None:
+            faults += [self._maps.fault] if self._maps.fault else []
+            values["map_topic"] = self._maps.text or "no map yet"
         for source in self._sources:
             camera = source in self._cameras
             age = source.age_s()

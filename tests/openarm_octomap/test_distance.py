@@ -16,7 +16,7 @@ LATTICE = Lattice.from_bounds(0.02, (0, 0, 0), (0.8, 0.64, 0.48))
 
 def blocks_of(states: np.ndarray) -> VoxelBlocks:
     blocks = VoxelBlocks(LATTICE)
-    blocks.set_states(states, np.array([np.nan, -1.0, 1.0], np.float32))
+    blocks.set_layers(0, np.array([np.nan, -1.0, 1.0], np.float32)[states])
     return blocks
 
 

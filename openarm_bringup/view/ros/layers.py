@@ -173,7 +173,7 @@ def _show_cloud(description: RobotDescription, camera: CameraConfig) -> Show:
 
 def _map(message: Octomap) -> bytes:
     """Occupied cells of a map."""
-    leaves = decode(np.frombuffer(message.data, np.uint8), message.resolution, binary=message.binary)
+    leaves = decode(np.frombuffer(message.data, np.uint8), message.resolution, binary=message.binary, tree=message.id)
     cells = wire.occupied_cells(leaves)
     return wire.frame({"kind": "map", "count": len(cells)}, cells)
 
