@@ -22,6 +22,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.blocks import CellSet
 from openarm_common.octree.codec import TREE_ID, Leaves, Payload, encode_states, read_file, write_file
 from openarm_common.octree.lattice import DEPTH, Lattice
+from openarm_common.printable import printable
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.self_filter import SelfFilter, Shapes
@@ -336,7 +337,7 @@ class Mapper:
         if abs(leaves.resolution - edge) > 1e-6 * edge:
             text += f" of {leaves.resolution:g} m in cells of {edge:g} m"
         if leaves.tree not in (TREE_ID, "1"):
-            text += f" of a {leaves.tree[:40]}, of which the occupancy alone is taken"
+            text += f" of a {printable(leaves.tree, longest=40)}, of which the occupancy alone is taken"
         text += f"; {counts['occupied']} cells are occupied and {counts['free']} free"
         return Taken(leaves.nodes, outside, f"{text}; {outside} leaves outside of the workspace")
 

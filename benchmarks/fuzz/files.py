@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import json
 import random
+import struct
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -196,10 +197,22 @@ def _maps(folder: Path) -> list[Reader]:
     one.save(folder / "map.bt")
     one.save(folder / "map.ot")
     target = mapper()
-    return [
-        Reader(f"altered{suffix}", ((folder / f"map{suffix}").read_bytes(),), altered_bytes, target.load)
-        for suffix in (".bt", ".ot")
-    ] + [Reader("wrong.bt", ((folder / "map.ot").read_bytes(),), altered_bytes, target.load)]
+    binary, full = ((folder / f"map{suffix}").read_bytes() for suffix in (".bt", ".ot"))
+    head, _, tree = full.partition(b"\ndata\n")
+    nodes = np.frombuffer(tree, np.uint8).reshape(-1, 5)
+    colored = np.insert(nodes, [4, 4, 4], 200, axis=1).tobytes()
+    first = struct.pack("<idI", 3, 0.02, len(nodes)) + binary.partition(b"\ndata\n")[2]
+
+    def sized(data: bytes, rng: random.Random) -> bytes:
+        edge = rng.choice((b"0.0001", b"0.0007", b"0.01", b"0.025", b"0.04", b"0.05", b"3", b"100"))
+        return altered_bytes(data.replace(b"res 0.02", b"res " + edge), rng) if rng.random() < 0.8 else data
+
+    files: list[tuple[str, bytes, Alter]] = [
+        ("altered.bt", binary, altered_bytes), ("altered.ot", full, altered_bytes), ("wrong.bt", full, altered_bytes),
+        ("color.ot", head.replace(b"id OcTree", b"id ColorOcTree") + b"\ndata\n" + colored, altered_bytes),
+        ("first.bt", first, altered_bytes), ("sized.bt", binary, sized), ("sized.ot", full, sized),
+    ]  # fmt: skip
+    return [Reader(name, (sound,), way, target.load) for name, sound, way in files]
 
 
 # --- text

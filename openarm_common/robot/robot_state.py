@@ -248,6 +248,14 @@ class RobotStateBuffer:
         link, T_link_frame = self._carrier(frame)
         return self._description.link_pose(link, q) @ T_link_frame
 
+    def knows(self, frame: str) -> bool:
+        """Whether a frame is connected to the root."""
+        try:
+            self._carrier(frame)
+        except OpenArmError:
+            return False
+        return True
+
     def moves(self, frame: str) -> bool:
         """Whether a moving joint lies between the base and a frame.
 

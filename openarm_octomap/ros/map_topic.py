@@ -56,19 +56,18 @@ class MapTopic:
         self._waiting = None
         try:
             T_base_map = self._pose(message.header.frame_id)
-            text: str = await self._node.in_thread(self._take, message, T_base_map)
+            self.text = await self._node.in_thread(self._take, message, T_base_map)
         except OpenArmError as error:
             self.fault = f"{self._topic}: {error.message}"
-            if error.code is Code.NO_TRANSFORM:  # which may come later
-                self._waiting = message
-                return
-            raise
-        self.fault, self.text = "", text
-        self._node.get_logger().info(f"{self._topic} replaces the map: {text}")
+            self._waiting = message if error.code is Code.NO_TRANSFORM else None  # it may come later
+            self._node.refuse(self._topic, error)
+            return
+        self.fault = ""
+        self._node.get_logger().info(f"{self._topic} replaces the map: {self.text}")
         self._show()
 
     async def _on_timer(self) -> None:
-        if self._waiting is not None:
+        if self._waiting is not None and self._states.buffer.knows(self._waiting.header.frame_id):
             await self._on_map(self._waiting)
 
     def _take(self, message: Octomap, T_base_map: Array | None) -> str:

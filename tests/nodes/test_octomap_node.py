@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import array
+import struct
 import time
 from functools import partial
 from pathlib import Path
@@ -16,6 +18,7 @@ from octomap_msgs.srv import BoundingBoxQuery, GetOctomap
 from openarm_interfaces.srv import ClearMap, MapFile, QueryMap
 from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Empty
+from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
@@ -26,6 +29,7 @@ from openarm_common.ros.convert import (
     cloud_from_points,
     info_from_intrinsics,
     matrix_to_pose,
+    matrix_to_transform,
     ns_to_stamp,
     points_from_cloud,
     stamp_to_ns,
@@ -305,3 +309,41 @@ def test_unknown_cameras_and_wrong_parameters_are_refused(ros) -> None:
     for params, text in (({"cameras": ["spectator"]}, "has no depth"), ({"grid.resolution": 0.0}, "grid.resolution")):
         with pytest.raises(OpenArmError, match=text):
             ros.start(OctomapNode, **params)
+
+
+def test_a_map_of_another_program_comes_by_a_topic(ros, tmp_path) -> None:
+    """In any class with occupancy and of any cells; in a frame that is fixed to the robot, once that is known."""
+    bench = Bench(ros, tmp_path, map_topic="/map_server/octomap_full")
+    publisher = ros.node.create_publisher(Octomap, "/map_server/octomap_full", QOS_LATCHED)
+
+    def value(log_odds: float, children: int) -> bytes:
+        return struct.pack("<f3BB", log_odds, 255, 0, 0, children)
+
+    # one cell of 4 cm at (0.40 .. 0.44, 0.24 .. 0.28, 0.40 .. 0.44): each node names the child on the way there
+    keys = [32768 + round(v / 0.04) for v in (0.40, 0.24, 0.40)]
+    path = [sum((key >> level & 1) << k for k, key in enumerate(keys)) for level in range(15, -1, -1)]
+    data = b"".join(value(1.0, 1 << child) for child in path) + value(1.0, 0)
+    message = Octomap(binary=False, id="ColorOcTree", resolution=0.04, data=array.array("b", data))
+    message.header.frame_id = "map"
+    publisher.publish(message)
+    bench.ros.spin_until(lambda: bench.heard("frame 'map' is not connected"), what="the frame is missed")
+    assert bench.heard("--child-frame-id 'map'")
+    static = TFMessage(transforms=[matrix_to_transform("map", ROBOT.root, se3.make(None, (0.0, 0.0, 0.1)), 0)])
+    bench.static.publish(static)
+    bench.ros.spin_until(lambda: "ColorOcTree" in bench.value("map_topic"), what="the map is taken")
+    T_root_base = ROBOT.link_pose(BASE_FRAME, {})
+    at = (np.array([0.42, 0.26, 0.42]) - (0.0, 0.0, 0.1)) - T_root_base[:3, 3]
+    bench.ros.spin_until(lambda: bench.state(tuple(at)) == "occupied", what="its cell is in the map")
+    assert "17 nodes of 0.04 m in cells of 0.02 m of a ColorOcTree" in bench.value("map_topic")
+    message.header.frame_id, message.id = BASE_FRAME, "SemanticOcTree"
+    publisher.publish(message)
+    bench.ros.spin_until(lambda: bench.heard("expected one of OcTree"), what="another class is named")
+    assert bench.state(tuple(at)) == "occupied"
+    message.header.frame_id, message.id = "openarm_left_hand", "ColorOcTree"
+    publisher.publish(message)
+    bench.ros.spin_until(lambda: bench.heard("moves with the robot"), what="a moving frame is named")
+
+
+def test_the_map_of_the_node_is_no_map_of_another_program(ros) -> None:
+    with pytest.raises(OpenArmError, match="which this node publishes itself"):
+        ros.start(OctomapNode, map_topic="/octomap_full")

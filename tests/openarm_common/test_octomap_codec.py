@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -112,10 +113,18 @@ HEAD = b"# Octomap OcTree binary file\nid OcTree\nsize 17\nres 0.02\ndata\n"
         (b"", "not an octree file"),
         (b"P5\n640 480\ndata\n", "not an octree file"),
         (HEAD[:-5], "not an octree file"),
-        (HEAD.replace(b"id OcTree", b"id ColorOcTree"), "class 'ColorOcTree'"),
+        (
+            HEAD.replace(b" binary", b"").replace(b"id OcTree", b"id CountingOcTree"),
+            "'CountingOcTree', expected one of",
+        ),
+        (HEAD.replace(b" binary", b"").replace(b"id OcTree", b"id ColorOcTree") + b"\0" * 7, "ends after 7 bytes"),
         (HEAD.replace(b"res 0.02", b"res 0"), "res is 0"),
         (HEAD.replace(b"res 0.02", b"res nan"), "res is nan"),
-        (HEAD.replace(b"size 17\n", b""), "needs numbers"),
+        (HEAD.replace(b"res 0.02\n", b""), "a line such as 'res 0.05'"),
+        (HEAD.replace(b"size 17", b"size many"), "header needs"),
+        (struct.pack("<idI", 3, -0.02, 1), "res is -0.02"),
+        (struct.pack("<idI", 3, 0.02, 3) + b"\x02\x00", "has 2 nodes, its header says 3"),
+        (struct.pack("<idI", 4, 0.02, 2) + b"\x02\x00", "not an octree file"),
         (HEAD + b"\x00", "ends after 1 bytes"),
         (HEAD + b"\x00\xc0" + b"\x03\x00" * 14 + b"\x02\x00\x00", "goes on for 1 bytes after the tree's end"),
         (HEAD + b"\x03\x00" * 16, "deeper than 16"),
@@ -152,3 +161,45 @@ def test_a_file_says_in_a_comment_of_which_robot_it_is(tmp_path: Path, robot: st
     lines = (tmp_path / "with.bt").read_bytes().partition(b"data\n")[0].decode().splitlines()
     assert lines[0] == "# Octomap OcTree binary file"  # all that readers require of comments
     assert [line for line in lines if not line.startswith("#")] == ["id OcTree", f"size {payload.nodes}", "res 0.02"]
+
+
+#: A tree of the full form: child 1 of the root is a leaf of log-odds 2.5, child 7 an inner node with a leaf of -1.5.
+FULL = ((2.5, (1, 7)), (2.5, ()), (-1.5, (0,)), (-1.5, ()))
+
+
+@pytest.mark.parametrize(("tree", "extra"), [("OcTree", 0), ("1", 0), ("OcTreeStamped", 0), ("ColorOcTree", 3)])
+def test_the_full_form_of_other_classes_is_read_for_its_occupancy(tree: str, extra: int) -> None:
+    """ColorOcTreeNode::writeData puts three bytes of colour after the log-odds; OcTreeNodeStamped writes no time."""
+    nodes = [
+        struct.pack("<f", value) + bytes(range(200, 200 + extra)) + bytes([sum(1 << c for c in children)])
+        for value, children in FULL
+    ]
+    leaves = decode(b"".join(nodes), 0.02, binary=False, tree=tree)
+    cells, values = leaves.arrays()
+    assert (leaves.nodes, leaves.tree) == (4, tree)
+    assert {(*map(int, cell), value) for cell, value in zip(cells, values.tolist(), strict=True)} == {
+        (15, 1, 0, 0, 2.5),
+        (14, 2, 2, 2, -1.5),
+    }
+
+
+ONE = b"\x00\xc0" + b"\x03\x00" * 14 + b"\x02\x00"
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        HEAD,
+        HEAD.replace(b"\n", b"\r\n"),
+        HEAD.replace(b"size 17\n", b""),
+        HEAD.replace(b"id OcTree\n", b"id SemanticOcTree\n"),
+        b"# Octomap OcTree binary file, of a robot\nres 0.02 size 17\n# data\ndate today\n\n  id\tOcTree\n data \n",
+        struct.pack("<idI", 3, 0.02, 17),
+    ],
+)
+def test_headers_of_other_programs_are_read(head: bytes, tmp_path: Path) -> None:
+    """Keys in any order, with comments and unknown ones as octomap skips them; and the first form, without text."""
+    (tmp_path / "x.bt").write_bytes(head + ONE)
+    leaves = read_file(tmp_path / "x.bt")
+    assert (leaves.resolution, leaves.nodes) == (0.02, 17)
+    assert leaves.arrays()[0].tolist() == [[0, 32768, 32768, 32768]]

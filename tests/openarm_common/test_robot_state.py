@@ -221,3 +221,16 @@ def test_a_stamp_is_settled_when_a_state_at_it_or_after_it_is_there(buffer: Robo
     buffer.add_joint_state(10, ["a"], [0.0])
     assert buffer.settled(10)
     assert not buffer.settled(11)
+
+
+def test_a_frame_above_the_root_is_known_by_its_edge_to_it(buffer: RobotStateBuffer) -> None:
+    """As a map is, in which the robot stands; a newer edge replaces it, and the edges of the robot stay."""
+    assert not buffer.knows("map")
+    for x in (1.0, 2.0):
+        buffer.set_static("map", "base", se3.make(se3.rot_z(math.pi / 2), (x, 0.0, 0.0)))
+    assert buffer.knows("map")
+    assert not buffer.moves("map")
+    T_base_map = buffer.lookup("base", "map", 0)
+    assert se3.apply(T_base_map, [2.0, 1.0, 0.5]) == pytest.approx([1.0, 0.0, 0.5])
+    buffer.set_static("map", "hand", np.eye(4))
+    assert buffer.lookup("base", "map", 0) == pytest.approx(T_base_map)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes reference.bt and the digest of reference.ot next to this file with liboctomap (through pyoctomap).
+"""Makes reference.bt and digests of reference.ot and of other cells next to this file with liboctomap (pyoctomap).
 
     pip install pyoctomap numpy
     python tests/openarm_octomap/data/make_reference.py
@@ -11,14 +11,18 @@ made of integers and of products in float32, so that every machine makes the sam
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 HEIGHT, WIDTH, FOCAL = 24, 32, 28.0
 RESOLUTION = 0.02
 FRAMES = 10
+#: Edges of the cells that the reference is looked up for, mm, and cells along each axis of their box around the origin.
+EDGES, CELLS = (10, 25, 30, 40, 50, 160), 16
 #: Turns of a quarter and of 3-4-5, so that no sine is needed: (cosine, sine) about z, then about x.
 TURNS = [(1.0, 0.0), (0.8, 0.6), (0.6, 0.8), (0.0, 1.0), (-0.6, 0.8), (-0.8, 0.6), (0.8, -0.6), (0.6, -0.8)]
 
@@ -52,6 +56,22 @@ def points(depth: np.ndarray, T: np.ndarray) -> np.ndarray:
     return np.stack(xyz, axis=-1)[depth > 0]
 
 
+def state_at(tree: Any, edge: int) -> np.ndarray:
+    """What liboctomap says of cells of `edge` mm: occupied (2) where a part is, free (1) where all is, unknown (0).
+
+    Args:
+        tree: OcTree of cells of 20 mm.
+        edge: All of its parts of the size of the greatest common divisor are looked up.
+    """
+    part = math.gcd(edge, 20)
+    n = edge // part
+    at = (np.arange(-CELLS // 2 * n, CELLS // 2 * n) + 0.5) * part * 1e-3
+    found = (tree.search([x, y, z]) for x in at for y in at for z in at)
+    states = np.array([0 if node is None else 2 if node.getLogOdds() >= 0.0 else 1 for node in found], np.uint8)
+    parts = states.reshape(CELLS, n, CELLS, n, CELLS, n).transpose(0, 2, 4, 1, 3, 5).reshape((CELLS,) * 3 + (-1,))
+    return np.where((parts == 2).any(-1), 2, np.where((parts == 1).all(-1), 1, 0)).astype(np.uint8)
+
+
 def main() -> None:
     """Write the files."""
     import pyoctomap
@@ -66,6 +86,8 @@ def main() -> None:
     (here / "reference.ot.sha256").write_text(hashlib.sha256(full.read_bytes()).hexdigest() + "\n")
     full.unlink()
     tree.writeBinary(str(here / "reference.bt"))
+    states = {edge: hashlib.sha256(state_at(tree, edge).tobytes()).hexdigest() for edge in EDGES}
+    (here / "resampled.sha256").write_text("".join(f"{edge} {digest}\n" for edge, digest in states.items()))
 
 
 if __name__ == "__main__":
