@@ -39,8 +39,9 @@ from scipy.spatial import cKDTree
 from benchmarks.report import Row, write_report
 from openarm_common import se3
 from openarm_common.types import Array
-from openarm_perception.frames.images import intrinsics_of
-from openarm_perception.frames.pcd import OrganisedCloud, read_pcd
+from openarm_perception.frames.cloud_fields import Cloud
+from openarm_perception.frames.clouds import intrinsics_of
+from openarm_perception.frames.pcd import read_pcd
 from openarm_perception.segmentation.clusters import segment
 from openarm_perception.segmentation.draw import overlay
 
@@ -97,7 +98,7 @@ def score(found: Label, true: Label) -> Score:
     return Score(common[rows, columns].sum(), n_found.sum(), n_true.sum(), int((best >= 0.75).sum()), len(n_true))
 
 
-def objects_of(cloud: OrganisedCloud, support: tuple[int, ...] | None) -> Label:
+def objects_of(cloud: Cloud, support: tuple[int, ...] | None) -> Label:
     """Return the labels (h, w) of objects, 0 elsewhere."""
     if cloud.label is None:
         raise SystemExit("a cloud has no field `label`")
@@ -115,12 +116,12 @@ def objects_of(cloud: OrganisedCloud, support: tuple[int, ...] | None) -> Label:
     return label
 
 
-def ours(cloud: OrganisedCloud) -> Label:
+def ours(cloud: Cloud) -> Label:
     """The suite's."""
     return segment(cloud.points, intrinsics_of(cloud.points), rgb=cloud.rgb).label.astype(np.int64)
 
 
-def euclidean(cloud: OrganisedCloud) -> Label:
+def euclidean(cloud: Cloud) -> Label:
     """PCL's tutorial on Euclidean cluster extraction."""
     seen = np.isfinite(cloud.points[..., 2])
     points = cloud.points[seen].astype(np.float64)
@@ -156,18 +157,18 @@ def _ransac(points: Array) -> tuple[Array, float]:
     return sign * normals[best], sign * float(offsets[best])
 
 
-def _only(cloud: OrganisedCloud, keep: object) -> OrganisedCloud:
+def _only(cloud: Cloud, keep: object) -> Cloud:
     """Return rows and columns of a cloud."""
     parts = (None if v is None else np.ascontiguousarray(v[keep]) for v in (cloud.points, cloud.rgb, cloud.label))
-    return OrganisedCloud(*parts)  # type: ignore[arg-type]
+    return Cloud(*parts)  # type: ignore[arg-type]
 
 
-def _mirrored(cloud: OrganisedCloud) -> OrganisedCloud:
+def _mirrored(cloud: Cloud) -> Cloud:
     out = _only(cloud, np.s_[:, ::-1])
     return replace(out, points=out.points * np.array([-1.0, 1.0, 1.0], np.float32))
 
 
-def _noisy(cloud: OrganisedCloud, rng: np.random.Generator) -> OrganisedCloud:
+def _noisy(cloud: Cloud, rng: np.random.Generator) -> Cloud:
     """Add noise along the rays, deviation 1.5 mm at 1 m and growing with the square, equal over 2 x 2 pixels."""
     z = cloud.points[..., 2]
     coarse = rng.standard_normal(((z.shape[0] + 1) // 2, (z.shape[1] + 1) // 2)).astype(np.float32)
@@ -175,7 +176,7 @@ def _noisy(cloud: OrganisedCloud, rng: np.random.Generator) -> OrganisedCloud:
     return replace(cloud, points=cloud.points * (1.0 + 0.0015 * z * noise)[..., None])
 
 
-def _turned(cloud: OrganisedCloud, axis: int, degrees: float) -> OrganisedCloud:
+def _turned(cloud: Cloud, axis: int, degrees: float) -> Cloud:
     """Turn the camera in its place: of a pinhole camera a homography, whatever the depth."""
     lens = intrinsics_of(cloud.points)
     K = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
@@ -192,7 +193,7 @@ def _turned(cloud: OrganisedCloud, axis: int, degrees: float) -> OrganisedCloud:
     return replace(out, points=np.where(inside[..., None], p[..., 2:] * rays, np.nan).astype(np.float32))
 
 
-def _holed(cloud: OrganisedCloud, rng: np.random.Generator) -> OrganisedCloud:
+def _holed(cloud: Cloud, rng: np.random.Generator) -> Cloud:
     """Take 40 patches of up to 30 x 30 pixels and a twentieth of all pixels away."""
     points = cloud.points.copy()
     height, width = points.shape[:2]
@@ -203,13 +204,13 @@ def _holed(cloud: OrganisedCloud, rng: np.random.Generator) -> OrganisedCloud:
     return replace(cloud, points=points)
 
 
-def _cropped(cloud: OrganisedCloud) -> OrganisedCloud:
+def _cropped(cloud: Cloud) -> Cloud:
     height, width = cloud.points.shape[:2]
     return _only(cloud, np.s_[height // 8 : -height // 8, width // 8 : -width // 8])
 
 
 #: By name; what is drawn is the same for every cloud.
-PERTURBATIONS: Mapping[str, Callable[[OrganisedCloud], OrganisedCloud]] = {
+PERTURBATIONS: Mapping[str, Callable[[Cloud], Cloud]] = {
     "noise": lambda cloud: _noisy(cloud, np.random.default_rng(1)),
     "mirrored": _mirrored,
     "cropped": _cropped,
@@ -240,7 +241,7 @@ def perturbed(files: Sequence[Path], support: tuple[int, ...] | None) -> list[Ro
     return rows
 
 
-def timed(work: Callable[[OrganisedCloud], Label], cloud: OrganisedCloud, repeats: int) -> tuple[Label, float]:
+def timed(work: Callable[[Cloud], Label], cloud: Cloud, repeats: int) -> tuple[Label, float]:
     """Return the labels and the shortest CPU time, ms."""
     label, best = np.zeros((0, 0), np.int64), np.inf
     for _ in range(repeats):

@@ -20,7 +20,8 @@ import mujoco
 import numpy as np
 
 from openarm_common.camera.cameras import Intrinsics
-from openarm_perception.frames.pcd import OrganisedCloud, write_pcd
+from openarm_perception.frames.cloud_fields import Cloud
+from openarm_perception.frames.pcd import write_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
 
@@ -112,7 +113,7 @@ KINDS: tuple[Callable[[Random], str], ...] = (
 )  # fmt: skip
 
 
-def scene(seed: int, sensor: DepthNoiseConfig) -> tuple[OrganisedCloud, Intrinsics]:
+def scene(seed: int, sensor: DepthNoiseConfig) -> tuple[Cloud, Intrinsics]:
     """Return a labelled cloud and the intrinsics of its camera.
 
     Args:
@@ -144,7 +145,7 @@ def scene(seed: int, sensor: DepthNoiseConfig) -> tuple[OrganisedCloud, Intrinsi
         z = add_depth_noise(z, lens.fy, sensor, r)
     points = Deprojector(DepthLimits(near=0.1, far=3.0)).organised(z, lens)
     label[np.isnan(points[..., 2])] = 0
-    return OrganisedCloud(points, rgb, label), lens
+    return Cloud(points, rgb, label), lens
 
 
 def _model(r: Random) -> tuple[mujoco.MjModel, int]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from openarm_bringup.commands.connect import Domain, join_graph
 from openarm_bringup.outcome import Outcome, as_text
@@ -26,18 +27,20 @@ def perceive(
     background: Path | None = None,
     near: float = 0.1,
     far: float = 3.0,
+    unit: Literal["m", "mm"] = "m",
+    cloud_frame: Literal["optical", "body", "base"] = "optical",
     domain: Domain = None,
     timeout: float = 10.0,
 ) -> Outcome:
-    """Find what stands on the table in a frame of a depth camera: two images, an organised cloud, a bag, or topics.
+    """Find what stands on the table in a frame of a depth camera: two images, a cloud, a bag, or topics.
 
     The table is found; with --pose it is level. Distortion is removed. Depth of topics is aligned with colour by both
     camera_infos and /tf_static; depth of files must be aligned.
 
     Args:
         files: Colour image (PNG, JPEG) and depth image (PNG of 16 bits, 0 where nothing was measured, or TIFF of
-            floats); or an organised cloud (.pcd); or a bag (folder of rosbag2, .mcap, .db3); or nothing, for a camera
-            of the running graph.
+            floats); or a cloud (.pcd, .ply, .npy, .xyz); or a bag (folder of rosbag2, .mcap, .db3); or nothing, for a
+            camera of the running graph.
         info: Intrinsics of images, with distortion: YAML of a CameraInfo, of OpenCV or Kalibr, JSON, or three rows of
             three numbers. Of a bag or graph: topic of the colour image's CameraInfo.
         color: Topic of the colour image in a bag or graph, also compressed; by the names of drivers when not given.
@@ -52,6 +55,9 @@ def perceive(
         background: Depth image, or cloud, of the empty table or box from the same place.
         near: Nearest depth that counts, m.
         far: Farthest depth that counts, m.
+        unit: Of the coordinates of a cloud.
+        cloud_frame: Axes of a cloud: optical (x right, y down, z forward) or body (x forward, z up), each of the camera
+            that took it, or base (z up, the origin anywhere), which is looked at from above.
         timeout: Longest wait for a camera of the running graph, s.
     """
     from openarm_bringup.bags.files import is_recording
@@ -60,17 +66,18 @@ def perceive(
     from openarm_common.config import load_config
     from openarm_common.resources import config_dir
     from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+    from openarm_perception.frames.clouds import is_cloud, read_cloud
     from openarm_perception.frames.found import find
-    from openarm_perception.frames.images import read_cloud, read_depth, read_frame, read_pose
-    from openarm_perception.geometry.depth import DepthLimits
+    from openarm_perception.frames.images import read_depth, read_frame, read_pose
+    from openarm_perception.geometry.depth import UNLIMITED, DepthLimits
 
     if not 0.0 < near < far <= 1000.0:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"--near {near:g} and --far {far:g} m; expected 0 < near < far <= 1000"
         )
     limits = DepthLimits(near=near, far=far)
-    cloud = len(files) == 1 and files[0].suffix.lower() == ".pcd"
-    bag = len(files) == 1 and (files[0].is_dir() or is_recording(files[0]))
+    cloud = None
+    bag = len(files) == 1 and not is_cloud(files[0]) and (files[0].is_dir() or is_recording(files[0]))
     of_topics = bag or not files
     if not of_topics and (color or depth or camera):
         raise OpenArmError(
@@ -79,39 +86,44 @@ def perceive(
     if of_topics:
         from openarm_bringup.ros.camera_frame import CameraChoice, frame_of_bag, frame_of_graph
 
-        chosen = CameraChoice(camera, color, depth, info, depth_scale, limits)
+        chosen = CameraChoice(camera, color, depth, info, depth_scale)
         if not bag:
             join_graph(domain)
         frame = frame_of_bag(files[0], chosen, start) if bag else frame_of_graph(chosen, timeout)
-    elif cloud:
+    elif len(files) == 1 and is_cloud(files[0]):
         if info:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{files[0]} is a cloud, which needs no --info")
-        frame = read_cloud(files[0], limits)
+        cloud = read_cloud(files[0], limits, unit, cloud_frame)
+        frame = cloud.frame
     elif len(files) != 2 or not info:
         missing = "--info" if len(files) == 2 else "depth image" if len(files) == 1 else "such number of files"
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
-            f"no {missing}; expected COLOUR DEPTH --info INTRINSICS, a cloud that ends in .pcd, or a bag",
+            f"no {missing}; expected COLOUR DEPTH --info INTRINSICS, a cloud (.pcd, .ply, .npy, .xyz), or a bag",
         )
     else:
-        frame = read_frame(*files, Path(info), depth_scale, limits)
+        frame = read_frame(*files, Path(info), depth_scale, UNLIMITED)
     empty = None
-    if background is not None and background.suffix.lower() == ".pcd":
-        empty = read_cloud(background, limits).points
+    if background is not None and is_cloud(background):
+        empty = read_cloud(background, limits, unit, cloud_frame, cloud).frame.points
     elif background is not None:
         lens = read_lens(Path(info), frame.size) if info and not of_topics else Lens(frame.intrinsics)
-        empty = read_depth(background, lens, depth_scale, limits)
-    T_base_camera = None if pose is None else read_pose(pose)
+        empty = read_depth(background, lens, depth_scale, UNLIMITED)
+    if pose is not None and cloud is not None and cloud.T_base_camera is not None:
+        raise OpenArmError(Code.INVALID_ARGUMENT, "--pose is that of a camera; expected none with --cloud-frame base")
+    T_base_camera = read_pose(pose) if pose is not None else None if cloud is None else cloud.T_base_camera
     if out is not None:
         try:
             out.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"--out {out} is no folder") from error
     colors = ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
-    found = find(frame, colors, T_base_camera, empty)
+    found = find(frame, limits, colors, T_base_camera, empty)
     written = () if out is None else found.write(out)
     count = len(found.segmentation.clusters)
     message = f"{count} on a plane with {found.segmentation.support.share:.0%} of what was measured"
+    if cloud is not None and cloud.note:
+        message += f"; {cloud.note}"
     if out is not None:
         message += f"; the page is {out / 'index.html'}"
     data = {**found.as_json(), "written": [str(path) for path in written]}

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import ContextNode
 from openarm_common.ros.node import QOS_STATIC_TF
 from openarm_perception.frames.images import Frame
-from openarm_perception.geometry.depth import DepthLimits
+from openarm_perception.geometry.depth import UNLIMITED
 from openarm_perception.ros.frames import CameraTopics, FrameBuilder, camera_topics
 
 
@@ -34,7 +34,6 @@ class CameraChoice:
         depth: Topic of the depth image, likewise.
         info: Topic of the CameraInfo of the colour image, likewise.
         depth_scale: Metres of a count of depth; None as for `metres`.
-        limits: Depths that count.
     """
 
     camera: str = ""
@@ -42,7 +41,6 @@ class CameraChoice:
     depth: str = ""
     info: str = ""
     depth_scale: float | None = None
-    limits: DepthLimits = field(default_factory=DepthLimits)
 
     def topics(self, kinds: Mapping[str, str]) -> CameraTopics:
         """Return its topics among those that there are, types by topic; errors as `camera_topics`."""
@@ -50,7 +48,7 @@ class CameraChoice:
 
     def builder(self, topics: CameraTopics, frames: Frames) -> FrameBuilder:
         """Return a builder of frames of these topics."""
-        return FrameBuilder(topics, self.limits, self.depth_scale, frames.between)
+        return FrameBuilder(topics, UNLIMITED, self.depth_scale, frames.between)
 
 
 class _Camera(ContextNode):

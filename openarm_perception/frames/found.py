@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.figures import data_uri, render_page
 from openarm_common.types import Array
 from openarm_perception.detection.detector import ColorDetector, Detection2D
 from openarm_perception.frames.images import Frame
-from openarm_perception.geometry.depth import Points
+from openarm_perception.geometry.depth import DepthLimits, Points
 from openarm_perception.segmentation.clusters import Cluster, Segmentation, segment
 from openarm_perception.segmentation.draw import depth_picture, label_picture, overlay
 
@@ -119,27 +122,60 @@ class Found:
 
 
 def find(
-    frame: Frame, colors: ColorDetector, T_base_camera: Array | None = None, background: Points | None = None
+    frame: Frame,
+    limits: DepthLimits,
+    colors: ColorDetector,
+    T_base_camera: Array | None = None,
+    background: Points | None = None,
 ) -> Found:
     """Segment a frame, and detect what has a colour of the palette.
 
     Args:
-        frame: The frame.
+        frame: The frame, with all that was measured.
+        limits: Depths that count.
         colors: Finds and names colours.
         T_base_camera: (4, 4) optical frame in a frame whose z points up; None: not known.
         background: (h, w, 3) points of the empty scene; None: not known.
 
     Raises:
-        OpenArmError: NOTHING_DETECTED, when there is no plane that things may stand on; BAD_IMAGE, for a background of
-            another size.
+        OpenArmError: NOTHING_DETECTED, when there is no plane that things may stand on, with the depths that there are;
+            BAD_IMAGE, for a background of another size.
     """
-    result = segment(frame.points, frame.intrinsics, rgb=frame.rgb, T_base_camera=T_base_camera, background=background)
+    measured, frame = frame.points[..., 2], replace(frame, points=_within(frame.points, limits))
+    try:
+        result = segment(
+            frame.points, frame.intrinsics, rgb=frame.rgb, T_base_camera=T_base_camera,
+            background=None if background is None else _within(background, limits),
+        )  # fmt: skip
+    except OpenArmError as error:
+        if error.code is not Code.NOTHING_DETECTED:
+            raise
+        raise OpenArmError(error.code, f"{error.message}; {_depths(measured, limits)}") from error
     rgb = frame.rgb
     if rgb is None:
         return Found(frame, result, (), ("",) * len(result.clusters), T_base_camera is not None)
     named = [colors.name(np.ascontiguousarray(rgb[one.window]), one.mask) for one in result.clusters]
     names = tuple(name if share >= _COLORED else "" for name, share in named)
     return Found(frame, result, colors.detect(rgb), names, T_base_camera is not None)
+
+
+def _within(points: Points, limits: DepthLimits) -> Points:
+    """Return points, NaN where their depth does not count."""
+    z = points[..., 2]
+    return np.where(((z >= limits.near) & (z <= limits.far))[..., None], points, np.float32(np.nan))
+
+
+def _depths(z: NDArray[np.float32], limits: DepthLimits) -> str:
+    """Say which depths were measured, how many of them count, and what to type so that they do."""
+    there = z[np.isfinite(z)]
+    if not there.size:
+        return "no pixel has a depth"
+    first, last = (float(v) for v in np.percentile(there, (5.0, 95.0)))
+    share = float(np.mean((there >= limits.near) & (there <= limits.far)))
+    near = f" --near {max(math.floor(first * 100.0), 1) / 100.0:g}" if first < limits.near else ""
+    far = f" --far {math.ceil(last * 10.0) / 10.0:g}" if last > limits.far else ""
+    text = f"depths are {first:.3g} to {last:.3g} m (5th to 95th percentile), of which {share:.0%} lie within"
+    return f"{text} --near {limits.near:g} and --far {limits.far:g}" + (f": type{near}{far}" if near or far else "")
 
 
 def _png(picture: Any) -> bytes:

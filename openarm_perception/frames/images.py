@@ -19,13 +19,11 @@ from openarm_common.camera.lens_files import read_lens
 from openarm_common.camera.pictures import decode_picture, to_bytes
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array, Bytes, Floats
-from openarm_perception.frames.pcd import MOST_POINTS, read_pcd
+from openarm_perception.frames.cloud_fields import MOST_POINTS
 from openarm_perception.geometry.depth import Deprojector, DepthLimits, Points
 
 #: Most bytes of a file with an image, and of one with numbers.
 _MOST_BYTES, _MOST_TEXT = 256_000_000, 100_000
-#: An organised cloud is a pinhole camera's when its points are within this of their pixels, rms.
-_PINHOLE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,51 +107,6 @@ def metres(counts: DepthImage, scale: float | None) -> Floats:
     return counts.astype(np.float32) * np.float32(unit_scale(counts) if scale is None else scale)
 
 
-def read_cloud(path: Path, limits: DepthLimits) -> Frame:
-    """Read a frame that is an organised cloud in a PCD file; the intrinsics are those that its points fit.
-
-    Args:
-        path: Of the file.
-        limits: Depths that count.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, for what is no such file, or was not seen by a pinhole camera.
-    """
-    cloud = read_pcd(path)
-    lens = intrinsics_of(cloud.points)
-    z = cloud.points[..., 2]
-    cloud.points[~((z >= limits.near) & (z <= limits.far))] = np.nan
-    return Frame(cloud.points, cloud.rgb, lens)
-
-
-def intrinsics_of(points: Points) -> Intrinsics:
-    """Return the intrinsics of the camera that saw organised points (h, w, 3), by least squares.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, when they are no image of a pinhole camera without distortion.
-    """
-    height, width = points.shape[:2]
-    v, u = np.nonzero(points[..., 2] > 0.0)
-    keep = slice(None, None, max(1, len(v) // 20_000))
-    v, u = v[keep], u[keep]
-    p = points[v, u].astype(np.float64)
-    values: list[float] = []
-    off = np.inf
-    if len(v) >= 100:
-        off = 0.0
-        for pixel, ray in ((u, p[:, 0] / p[:, 2]), (v, p[:, 1] / p[:, 2])):
-            A = np.column_stack([ray, np.ones(len(ray))])
-            (f, c), *_ = np.linalg.lstsq(A, pixel.astype(np.float64), rcond=None)
-            off = max(off, float(np.sqrt(np.mean((A @ (f, c) - pixel) ** 2))))
-            values += [float(f), float(c)]
-    lens = Intrinsics(width, height, values[0], values[2], values[1], values[3]) if values else None
-    if lens is None or off > _PINHOLE or lens.fault():
-        why = f"fewer than 100 points (of {width}x{height})" if lens is None else f"points {off:.1f} pixels (rms) off"
-        raise OpenArmError(
-            Code.BAD_IMAGE,
-            f"the cloud has {why} the image of a pinhole camera; expected x right, y down, z forward in the optical"
-            " frame, a point per pixel",
-        )
     return lens
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Organised clouds in PCD files: ascii, binary, binary_compressed, as PCL writes them.
+"""Clouds in PCD files: ascii, binary, binary_compressed, as PCL writes them.
 
 Format: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. The compressed form is LZF, with the
 values of one field after those of the other.
@@ -16,31 +16,16 @@ from numpy.typing import NDArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.kernels import kernel
 from openarm_common.types import Bytes
-from openarm_perception.geometry.depth import Points
+from openarm_perception.frames.cloud_fields import MOST_POINTS, Cloud, cloud_of, refused
 
-#: Most points of a cloud, and most bytes of a header.
-MOST_POINTS, _MOST_HEADER = 8_000_000, 8192
+#: Most bytes of a header.
+_MOST_HEADER = 8192
 _MOST_FIELDS, _MOST_COUNT = 64, 1024
 _TYPES = {
     ("F", 4): "<f4", ("F", 8): "<f8", ("U", 1): "<u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8",
     ("I", 1): "<i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8",
 }  # fmt: skip
 _FORMS = ("ascii", "binary", "binary_compressed")
-
-
-@dataclass(frozen=True, eq=False)
-class OrganisedCloud:
-    """A cloud with a point per pixel.
-
-    Attributes:
-        points: (h, w, 3) float32, as in the file (the optical frame of the camera, m); NaN where nothing was measured.
-        rgb: (h, w, 3) uint8; None without the field `rgb` or `rgba`.
-        label: (h, w) int64 of the field `label`; None without it.
-    """
-
-    points: Points
-    rgb: Bytes | None
-    label: NDArray[np.int64] | None
 
 
 @dataclass(frozen=True)
@@ -62,12 +47,12 @@ class _Header:
         return np.dtype([(f"f{i}", t, (c,)) for i, (t, c) in enumerate(zip(self.types, self.counts, strict=True))])
 
 
-def read_pcd(path: Path) -> OrganisedCloud:
-    """Read an organised cloud.
+def read_pcd(path: Path) -> Cloud:
+    """Read a cloud.
 
     Raises:
-        OpenArmError: BAD_IMAGE, for what is no PCD file, is cut short, has no x, y, z, is not organised (HEIGHT 1), or
-            has more than MOST_POINTS points.
+        OpenArmError: BAD_IMAGE, for what is no PCD file, is cut short, has no x, y, z, or has more than MOST_POINTS
+            points.
     """
     try:
         with path.open("rb") as file:
@@ -76,23 +61,11 @@ def read_pcd(path: Path) -> OrganisedCloud:
             data = file.read(head.width * head.height * _most_bytes(head))
     except OSError as error:
         raise OpenArmError(Code.BAD_IMAGE, f"can't read {path}: {error.strerror}") from error
-    fields = _fields(data, head, path)
-    shape = (head.height, head.width)
-    points = np.stack([fields[axis].astype(np.float32) for axis in "xyz"], axis=-1).reshape(*shape, 3)
-    points[~np.isfinite(points).all(axis=-1)] = np.nan
-    color = next((fields[name] for name in ("rgb", "rgba") if name in fields and fields[name].itemsize == 4), None)
-    rgb = None
-    if color is not None:
-        packed = np.ascontiguousarray(color).view(np.uint8).reshape(*shape, 4)
-        rgb = np.ascontiguousarray(packed[..., 2::-1])
-    label = fields["label"].reshape(shape) if "label" in fields else None
-    if label is not None and label.dtype.kind == "f":
-        label = np.nan_to_num(label, nan=0.0, posinf=0.0, neginf=0.0).clip(-(2**31), 2**31)
-    return OrganisedCloud(points, rgb, None if label is None else label.astype(np.int64))
+    return cloud_of(_fields(data, head, path), (head.height, head.width))
 
 
-def write_pcd(path: Path, cloud: OrganisedCloud) -> None:
-    """Write an organised cloud as binary PCD, with fields x y z, and rgb and label where it has them."""
+def write_pcd(path: Path, cloud: Cloud) -> None:
+    """Write a cloud as binary PCD, with fields x y z, and rgb and label where it has them."""
     height, width = cloud.points.shape[:2]
     columns: list[tuple[str, str, NDArray[np.uint32] | NDArray[np.float32]]] = [
         (axis, "F", cloud.points[..., i].astype("<f4")) for i, axis in enumerate("xyz")
@@ -121,31 +94,31 @@ def _header(data: bytes, path: Path) -> _Header:
     while "DATA" not in lines:
         end = data.find(b"\n", begin)
         if end < 0:
-            raise _refused(path, f"has no line DATA within {_MOST_HEADER} bytes", "a PCD file")
+            raise refused(path, f"has no line DATA within {_MOST_HEADER} bytes", "a PCD file")
         words = data[begin:end].decode("ascii", errors="replace").split()
         begin = end + 1
         if words and not words[0].startswith("#"):
             lines[words[0]] = words[1:]
     names = tuple(lines.get("FIELDS", ()))
     if not 3 <= len(names) <= _MOST_FIELDS or not {"x", "y", "z"} <= set(names):
-        raise _refused(path, f"has the fields {' '.join(names[:8]) or 'none'}", "x, y and z among them")
+        raise refused(path, f"has the fields {' '.join(names[:8]) or 'none'}", "x, y and z among them")
     sizes, counts = _numbers(lines, "SIZE", path), _numbers(lines, "COUNT", path, (1,) * len(names))
     kinds = lines.get("TYPE", [])
     if not len(names) == len(sizes) == len(counts) == len(kinds):
-        raise _refused(path, "has FIELDS, SIZE, TYPE and COUNT of different lengths", "the same")
+        raise refused(path, "has FIELDS, SIZE, TYPE and COUNT of different lengths", "the same")
     types = [_TYPES.get(pair, "") for pair in zip(kinds, sizes, strict=True)]
     if not all(types) or not all(1 <= count <= _MOST_COUNT for count in counts):
-        raise _refused(path, "has fields of an unknown type", "F 4 or 8, U or I 1, 2, 4 or 8")
+        raise refused(path, "has fields of an unknown type", "F 4 or 8, U or I 1, 2, 4 or 8")
     if any(counts[names.index(axis)] != 1 for axis in "xyz"):
-        raise _refused(path, "has several values in x, y or z", "one each")
+        raise refused(path, "has several values in x, y or z", "one each")
     width, height = (next(iter(_numbers(lines, name, path)), 0) for name in ("WIDTH", "HEIGHT"))
-    if height < 2 or width < 2:
-        raise _refused(path, f"is {width} by {height} points", "an organised cloud, a point per pixel of an image")
+    if height < 1 or width < 1:
+        raise refused(path, f"has {width} by {height} points", "at least one: lines WIDTH and HEIGHT")
     if width * height > MOST_POINTS:
-        raise _refused(path, f"has {width} by {height} points", f"at most {MOST_POINTS}")
+        raise refused(path, f"has {width} by {height} points", f"at most {MOST_POINTS}")
     form = " ".join(lines["DATA"])
     if form not in _FORMS:
-        raise _refused(path, f"has data of the form {form[:40]!r}", ", ".join(_FORMS))
+        raise refused(path, f"has data of the form {form[:40]!r}", ", ".join(_FORMS))
     return _Header(names, tuple(types), counts, width, height, form, begin)
 
 
@@ -154,7 +127,7 @@ def _numbers(lines: dict[str, list[str]], name: str, path: Path, otherwise: tupl
     if words is None:
         return otherwise
     if not all(word.isascii() and word.isdigit() and len(word) <= 9 for word in words):
-        raise _refused(path, f"has a line {name} {' '.join(words)[:40]}", "whole numbers")
+        raise refused(path, f"has a line {name} {' '.join(words)[:40]}", "whole numbers")
     return tuple(int(word) for word in words)
 
 
@@ -171,19 +144,19 @@ def _fields(data: bytes, head: _Header, path: Path) -> dict[str, NDArray[np.gene
     wanted = count * record.itemsize
     if head.form == "binary":
         if len(data) < wanted:
-            raise _refused(path, f"ends after {len(data)} of {wanted} bytes of data", "all of them")
+            raise refused(path, f"ends after {len(data)} of {wanted} bytes of data", "all of them")
         table = np.frombuffer(data, record, count)
         return {name: table[f"f{i}"][:, 0].copy() for i, name in enumerate(head.names) if head.counts[i] == 1}
     if len(data) < 8:
-        raise _refused(path, f"ends after {len(data)} bytes of data", "at least 8")
+        raise refused(path, f"ends after {len(data)} bytes of data", "at least 8")
     packed, unpacked = (int(size) for size in np.frombuffer(data, "<u4", 2))
     if unpacked != wanted or len(data) < 8 + packed:
-        raise _refused(
+        raise refused(
             path, f"says {unpacked} bytes in {packed}, and {len(data) - 8} are there", f"{wanted} bytes, and all there"
         )
     raw = np.empty(wanted, np.uint8)
     if unpack_lzf(np.frombuffer(data, np.uint8, packed, 8), raw) != wanted:
-        raise _refused(path, "has compressed data that are damaged", "LZF")
+        raise refused(path, "has compressed data that are damaged", "LZF")
     out: dict[str, NDArray[np.generic]] = {}
     at = 0
     for name, kind, number in zip(head.names, head.types, head.counts, strict=True):
@@ -198,7 +171,7 @@ def _words(data: bytes, head: _Header, path: Path) -> dict[str, NDArray[np.gener
     count, columns = head.width * head.height, sum(head.counts)
     words = data.split()
     if len(words) < count * columns:
-        raise _refused(path, f"ends after {len(words)} of {count * columns} values", "all of them")
+        raise refused(path, f"ends after {len(words)} of {count * columns} values", "all of them")
     out: dict[str, NDArray[np.generic]] = {}
     at = 0
     try:
@@ -209,7 +182,7 @@ def _words(data: bytes, head: _Header, path: Path) -> dict[str, NDArray[np.gener
                 out[name] = column.astype(np.float64).astype(kind)
             at += number
     except (ValueError, OverflowError) as error:
-        raise _refused(path, "has a value that is no number", "numbers or nan") from error
+        raise refused(path, "has a value that is no number", "numbers or nan") from error
     return out
 
 
@@ -253,7 +226,3 @@ def unpack_lzf(data: Bytes, out: Bytes) -> int:
             j += 1
             at += 1
     return j
-
-
-def _refused(path: Path, what: str, expected: str) -> OpenArmError:
-    return OpenArmError(Code.BAD_IMAGE, f"{path} {what}; expected {expected}")

@@ -36,6 +36,10 @@ class DepthLimits(Config):
         return self
 
 
+#: For whoever has to know all that was measured.
+UNLIMITED = DepthLimits(near=1e-6, far=1e6)
+
+
 @kernel
 def _organise(
     depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32, ray_x: Points, ray_y: Points, out: Points

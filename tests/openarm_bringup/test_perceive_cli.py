@@ -11,7 +11,8 @@ import pytest
 
 from openarm_bringup import cli
 from openarm_common.camera.cameras import Intrinsics
-from openarm_perception.frames.pcd import OrganisedCloud, read_pcd, write_pcd
+from openarm_perception.frames.cloud_fields import Cloud
+from openarm_perception.frames.pcd import read_pcd, write_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 from tests.openarm_bringup.commands import answer_of
 
@@ -35,7 +36,7 @@ def files(tmp_path: Path) -> tuple[str, ...]:
     cv2.imwrite(str(tmp_path / "z.png"), np.round(z * 1e4).astype(np.uint16))
     (tmp_path / "k.yaml").write_text(f"fx: {LENS.fx}\nfy: {LENS.fy}\ncx: {LENS.cx}\ncy: {LENS.cy}\n")
     points = Deprojector(DepthLimits()).organised(z.astype(np.float32), LENS)
-    write_pcd(tmp_path / "a.pcd", OrganisedCloud(points, np.ascontiguousarray(color[..., ::-1]), None))
+    write_pcd(tmp_path / "a.pcd", Cloud(points, np.ascontiguousarray(color[..., ::-1]), None))
     return str(tmp_path / "c.png"), str(tmp_path / "z.png"), "--info", str(tmp_path / "k.yaml")
 
 

@@ -14,8 +14,10 @@ from hypothesis import strategies as st
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
-from openarm_perception.frames.images import intrinsics_of, read_frame, read_pose
-from openarm_perception.frames.pcd import OrganisedCloud, read_pcd, unpack_lzf, write_pcd
+from openarm_perception.frames.cloud_fields import Cloud
+from openarm_perception.frames.clouds import intrinsics_of
+from openarm_perception.frames.images import read_frame, read_pose
+from openarm_perception.frames.pcd import read_pcd, unpack_lzf, write_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 from tests.refusals import refused
 
@@ -23,13 +25,13 @@ LIMITS = DepthLimits(near=0.1, far=5.0)
 LENS = Intrinsics(16, 12, 20.0, 21.0, 7.5, 5.0)
 
 
-def cloud() -> OrganisedCloud:
+def cloud() -> Cloud:
     rng = np.random.default_rng(0)
     z = rng.uniform(0.5, 1.0, (12, 16)).astype(np.float32)
     z[2, 3] = np.nan
     rgb = rng.integers(0, 256, (12, 16, 3)).astype(np.uint8)
     label = rng.integers(0, 5, (12, 16))
-    return OrganisedCloud(Deprojector(LIMITS).organised(z, LENS), rgb, label)
+    return Cloud(Deprojector(LIMITS).organised(z, LENS), rgb, label)
 
 
 def pack_lzf(data: bytes) -> bytes:
@@ -89,7 +91,7 @@ def test_intrinsics_are_those_that_a_cloud_fits():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ((b"HEIGHT 12", b"HEIGHT 1"), "organised"),
+        ((b"HEIGHT 12", b"HEIGHT 0"), "16 by 0 points"),
         ((b"HEIGHT 12", b"HEIGHT 999999999"), "at most"),
         ((b"HEIGHT 12", b"HEIGHT -12"), "whole numbers"),
         ((b"HEIGHT 12", b"HEIGHT 13"), "ends after"),

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of clouds: of an image as they are, others as a camera that is chosen to fit would see them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
+from openarm_perception.frames.cloud_fields import Cloud, refused
+from openarm_perception.frames.images import Frame
+from openarm_perception.frames.pcd import read_pcd
+from openarm_perception.frames.plain import read_npy, read_xyz
+from openarm_perception.frames.ply import read_ply
+from openarm_perception.frames.projection import WIDEST, fitting_camera, project
+from openarm_perception.geometry.depth import UNLIMITED, Deprojector, DepthLimits, Points
+
+Unit = Literal["m", "mm"]
+#: Axes of a cloud: of a camera (x right, y down, z forward), of a body or sensor (x forward, z up: REP-103), both with
+#: the sensor at their origin, or of anything that stands on the ground (z up, the origin anywhere).
+Axes = Literal["optical", "body", "base"]
+
+_READERS: Mapping[str, Callable[[Path], Cloud]] = {
+    ".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy, ".xyz": read_xyz,
+}  # fmt: skip
+#: What is a cloud, too, and what it is.
+_FOREIGN = {
+    ".las": "LAS", ".laz": "LAZ", ".e57": "E57", ".pts": "PTS", ".ptx": "PTX",
+}  # fmt: skip
+#: An organised cloud is a pinhole camera's when its points are within this of their pixels, rms.
+_PINHOLE = 1.0
+#: Median distances of points that are none in metres.
+_FAR_M, _NEAR_M = 100.0, 0.02
+#: Share of the points that lie before a camera, if they are its own; and smallest cloud.
+_AHEAD, _LEAST = 0.9, 100
+#: Height of the camera over the highest point of a cloud with z up, m; more over a wide one.
+_ABOVE = 1.0
+_T_OPTICAL_BODY = se3.make([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class CloudFrame:
+    """A frame of a cloud.
+
+    Attributes:
+        frame: The frame; depths are not limited.
+        T_base_camera: (4, 4) optical frame in that of the cloud, where its z is up; None: the cloud is of a camera.
+        note: How it was made, where it is no image as it is.
+    """
+
+    frame: Frame
+    T_base_camera: Array | None
+    note: str
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a file is a cloud by its name."""
+    return path.suffix.lower() in (*_READERS, *_FOREIGN)
+
+
+def read_cloud(
+    path: Path, limits: DepthLimits, unit: Unit = "m", axes: Axes = "optical", like: CloudFrame | None = None
+) -> CloudFrame:
+    """Read a cloud.
+
+    Args:
+        path: PCD, PLY, .npy or .xyz.
+        limits: Depths that count when a camera is chosen.
+        unit: Of its coordinates.
+        axes: Of its frame.
+        like: A cloud of the same place, whose camera is taken where this is no image.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, for another file, and where unit or axes do not fit; it says what to type.
+    """
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        kind = _FOREIGN.get(path.suffix.lower(), path.suffix)
+        how = f"convert it: pdal translate {path.name} {path.stem}.ply"
+        raise refused(path, f"is a {kind} file", f"{', '.join(_READERS)}; {how}")
+    cloud = reader(path)
+    cloud = Cloud(_metres(cloud.points, unit, path), cloud.rgb, cloud.label)
+    if axes == "base":
+        return _from_above(cloud, like)
+    if axes == "body":
+        cloud = Cloud(cloud.points @ _T_OPTICAL_BODY[:3, :3].T.astype(np.float32), cloud.rgb, cloud.label)
+    why = "is no image"
+    if cloud.organised:
+        try:
+            lens = intrinsics_of(cloud.points)
+        except OpenArmError:
+            why = "is the image of no pinhole camera"
+        else:
+            return CloudFrame(Frame(cloud.points, cloud.rgb, lens), None, "")
+    _require_ahead(cloud.points, axes, path)
+    frame = _projected(cloud, limits, None if like is None else like.frame.intrinsics)
+    size = f"{frame.intrinsics.width}x{frame.intrinsics.height}"
+    return CloudFrame(frame, None, f"the cloud {why}, and was projected into one of {size}, z forward")
+
+
+def intrinsics_of(points: Points) -> Intrinsics:
+    """Return the intrinsics of the camera that saw organised points (h, w, 3), by least squares.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, when they are no image of a pinhole camera without distortion.
+    """
+    height, width = points.shape[:2]
+    v, u = np.nonzero(points[..., 2] > 0.0)
+    keep = slice(None, None, max(1, len(v) // 20_000))
+    v, u = v[keep], u[keep]
+    p = points[v, u].astype(np.float64)
+    values: list[float] = []
+    off = np.inf
+    if len(v) >= 100:
+        off = 0.0
+        for pixel, ray in ((u, p[:, 0] / p[:, 2]), (v, p[:, 1] / p[:, 2])):
+            A = np.column_stack([ray, np.ones(len(ray))])
+            (f, c), *_ = np.linalg.lstsq(A, pixel.astype(np.float64), rcond=None)
+            off = max(off, float(np.sqrt(np.mean((A @ (f, c) - pixel) ** 2))))
+            values += [float(f), float(c)]
+    lens = Intrinsics(width, height, values[0], values[2], values[1], values[3]) if values else None
+    if lens is None or off > _PINHOLE or lens.fault():
+        why = f"fewer than 100 points (of {width}x{height})" if lens is None else f"points {off:.1f} pixels (rms) off"
+        raise OpenArmError(
+            Code.BAD_IMAGE,
+            f"the cloud has {why} the image of a pinhole camera; expected x right, y down, z forward in the optical"
+            " frame, a point per pixel",
+        )
+    return lens
+
+
+def _metres(points: Points, unit: Unit, path: Path) -> Points:
+    """Return points in metres; refuse those that can hardly be."""
+    scale = np.float32(1e-3 if unit == "mm" else 1.0)
+    distance = np.linalg.norm(points[..., :3].reshape(-1, 3)[:: max(1, points.size // 300_000)], axis=1)
+    distance = distance[np.isfinite(distance)]
+    if len(distance) < _LEAST:
+        raise refused(path, f"has {len(distance)} points of finite numbers", f"at least {_LEAST}")
+    middle = float(np.median(distance)) * float(scale)
+    if unit == "m" and middle > _FAR_M:
+        raise refused(
+            path, f"has half of its points farther than {middle:.0f} m", "metres; of millimetres type --unit mm"
+        )
+    if unit == "mm" and middle < _NEAR_M:
+        raise refused(path, f"has half of its points nearer than {middle * 1e3:.2g} mm", "millimetres; type --unit m")
+    return points * scale
+
+
+def _require_ahead(points: Points, axes: Axes, path: Path) -> None:
+    """Refuse points that are not before the camera, and say what fits."""
+    p = points.reshape(-1, 3)[:: max(1, points.size // 300_000)].astype(np.float64)
+    p = p[np.isfinite(p).all(axis=1)]
+    ways = {"optical": p, "body": p @ _T_OPTICAL_BODY[:3, :3].T} if axes == "optical" else {"body": p}
+    fit = [name for name, q in ways.items() if _ahead(q)]
+    if axes in fit:
+        return
+    what = "z forward" if axes == "optical" else "x forward"
+    instead = "with x forward type --cloud-frame body" if fit else "where z points up type --cloud-frame base"
+    others = "" if fit or axes == "optical" else ", where z points forward --cloud-frame optical"
+    raise refused(path, f"has points that no camera sees with {what}", f"that; {instead}{others}")
+
+
+def _ahead(points: Array) -> bool:
+    before = points[points[:, 2] > 0.0]
+    if len(before) < _AHEAD * len(points):
+        return False
+    low, high = np.percentile(before[:, :2] / before[:, 2:], (2.0, 98.0), axis=0)
+    return bool(low.min() > -WIDEST and high.max() < WIDEST)
+
+
+def _from_above(cloud: Cloud, like: CloudFrame | None) -> CloudFrame:
+    """Return what a camera over a cloud with z up sees."""
+    points = cloud.points.reshape(-1, 3)
+    finite = points[np.isfinite(points[:, 0])].astype(np.float64)
+    T = None if like is None else like.T_base_camera
+    if T is None:
+        middle = (finite.min(axis=0) + finite.max(axis=0)) / 2.0
+        above = max(_ABOVE, float(np.ptp(finite[:, :2], axis=0).max()) / WIDEST)
+        T = se3.make(np.diag([1.0, -1.0, -1.0]), (middle[0], middle[1], finite[:, 2].max() + above))
+    seen = se3.apply(se3.inverse(T), points.astype(np.float64)).astype(np.float32).reshape(cloud.points.shape)
+    lens = None if like is None else like.frame.intrinsics
+    frame = _projected(Cloud(seen, cloud.rgb, cloud.label), UNLIMITED, lens)
+    size = f"{frame.intrinsics.width}x{frame.intrinsics.height}"
+    x, y, z = T[:3, 3]
+    note = f"the cloud was projected into an image of {size} of a camera that looks down from {x:.2f} {y:.2f} {z:.2f} m"
+    return CloudFrame(frame, T, note)
+
+
+def _projected(cloud: Cloud, limits: DepthLimits, lens: Intrinsics | None) -> Frame:
+    points = cloud.points.reshape(-1, 3).astype(np.float64)
+    if lens is None:
+        within = points[(points[:, 2] >= limits.near) & (points[:, 2] <= limits.far)]
+        lens = fitting_camera(within if len(within) >= _LEAST else points[points[:, 2] > 0.0])
+    depth, number = project(points, lens)
+    organised = Deprojector(UNLIMITED).organised(depth, lens)
+    rgb = None
+    if cloud.rgb is not None:
+        rgb = np.concatenate([cloud.rgb.reshape(-1, 3), np.zeros((1, 3), np.uint8)])[number]
+    return Frame(organised, rgb, lens)

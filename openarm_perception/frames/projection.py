@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds that are no images as those of a pinhole camera, which is chosen to fit them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.types import Array, Floats, Ints
+
+#: Largest image, pixels each way and in all.
+_LONGEST, _MOST_PIXELS = 4096, 4_000_000
+#: Rays that are asked for the distance of their neighbours.
+_ASKED = 5000
+#: Pixels grow by this until fewer than this share of those that are surrounded have no point.
+_STEP, _HOLES = 1.15, 0.02
+#: A ray further aside (tangent) belongs to no image.
+WIDEST = 2.5
+
+
+def fitting_camera(points: Array) -> Intrinsics:
+    """Return a camera at the origin whose image has a pixel for each of the points, as far as they are as regular.
+
+    The points of a depth image are each in a pixel of their own again; a pixel has four or so of those that are strewn.
+
+    Args:
+        points: (n, 3), z forward and positive, m; at least one.
+    """
+    with np.errstate(over="ignore"):
+        rays = points[:, :2] / points[:, 2:]
+    rays = rays[(np.abs(rays) < WIDEST).all(axis=1)]
+    asked = rays[:: max(1, len(rays) // _ASKED)]
+    # of a grid the fourth neighbour is one step away, and of strewn points about as far as their mean distance
+    distance, _ = KDTree(rays).query(asked, k=min(5, len(rays)))
+    extent = np.ptp(rays, axis=0)
+    pitch = max(float(np.median(distance[:, -1])) if len(rays) > 1 else 0.0, float(extent.max()) / (_LONGEST - 1))
+    pitch = max(pitch, float(np.sqrt(np.prod(extent) / _MOST_PIXELS)), 1e-5)
+    while True:
+        # pixels lie where points of a grid do
+        at = np.round((rays - rays[0]) / pitch).astype(np.int64)
+        first, last = at.min(axis=0), at.max(axis=0)
+        width, height = (int(n) for n in last - first + 1)
+        filled = np.zeros((height, width), np.uint8)
+        filled[at[:, 1] - first[1], at[:, 0] - first[0]] = 1
+        around = cv2.boxFilter(filled, cv2.CV_16S, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        holes = int(np.count_nonzero((filled == 0) & (around >= 5)))
+        if holes <= _HOLES * int(filled.sum()) or max(width, height) < 16:
+            break
+        pitch *= _STEP
+    cx, cy = (float(v) for v in -rays[0] / pitch - first)
+    return Intrinsics(width, height, 1.0 / pitch, 1.0 / pitch, cx, cy)
+
+
+def project(points: Array, lens: Intrinsics) -> tuple[Floats, Ints]:
+    """Return the depth image of points, the nearest of each pixel.
+
+    Args:
+        points: (n, 3), z forward, m.
+        lens: Of the camera.
+
+    Returns:
+        (h, w) float32, m, NaN where there is no point; and (h, w) the number of the point, -1 where there is none.
+    """
+    which = np.flatnonzero(points[:, 2] > 0.0)
+    which = which[np.argsort(-points[which, 2], kind="stable")]  # of one pixel, the last one that is written stays
+    z = points[which, 2]
+    with np.errstate(over="ignore", invalid="ignore"):
+        u = np.round(points[which, 0] / z * lens.fx + lens.cx)
+        v = np.round(points[which, 1] / z * lens.fy + lens.cy)
+    seen = (u >= 0) & (u < lens.width) & (v >= 0) & (v < lens.height)
+    number: Ints = np.full((lens.height, lens.width), -1, np.int64)
+    number[v[seen].astype(np.int64), u[seen].astype(np.int64)] = which[seen]
+    depth: NDArray[Any] = np.append(points[:, 2], np.nan)[number].astype(np.float32)
+    return depth, number
