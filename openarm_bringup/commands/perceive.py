@@ -10,6 +10,8 @@ from openarm_bringup.commands.connect import Domain, join_graph
 from openarm_bringup.outcome import Outcome, as_text
 from openarm_common.errors import Code, OpenArmError
 
+#: Share of a cloud that a camera does not see below a table, but for noise.
+_HIDDEN = 0.005
 #: Columns of the table, wider than most terminals: its numbers are all there.
 _WIDE = 150
 
@@ -124,6 +126,10 @@ def perceive(
     message = f"{count} on a plane with {found.segmentation.support.share:.0%} of what was measured"
     if cloud is not None and cloud.note:
         message += f"; {cloud.note}"
+        if found.hidden() > _HIDDEN:
+            message += (
+                f"; {found.hidden():.0%} of the points lie below that plane: where z is up type --cloud-frame base"
+            )
     if out is not None:
         message += f"; the page is {out / 'index.html'}"
     data = {**found.as_json(), "written": [str(path) for path in written]}

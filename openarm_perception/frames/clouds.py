@@ -161,10 +161,10 @@ def _require_ahead(points: Points, axes: Axes, path: Path) -> None:
     fit = [name for name, q in ways.items() if _ahead(q)]
     if axes in fit:
         return
-    what = "z forward" if axes == "optical" else "x forward"
-    instead = "with x forward type --cloud-frame body" if fit else "where z points up type --cloud-frame base"
-    others = "" if fit or axes == "optical" else ", where z points forward --cloud-frame optical"
-    raise refused(path, f"has points that no camera sees with {what}", f"that; {instead}{others}")
+    forward, other = ("z", "") if axes == "optical" else ("x", ", where z is forward --cloud-frame optical")
+    instead = "with x forward type --cloud-frame body" if fit else f"where z is up type --cloud-frame base{other}"
+    what = f"is no cloud of a camera that looks along {forward}: too much lies behind it or far aside"
+    raise refused(path, what, f"one; {instead}")
 
 
 def _ahead(points: Array) -> bool:

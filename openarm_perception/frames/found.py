@@ -21,6 +21,8 @@ from openarm_perception.geometry.depth import DepthLimits, Points
 from openarm_perception.segmentation.clusters import Cluster, Segmentation, segment
 from openarm_perception.segmentation.draw import depth_picture, label_picture, overlay
 
+#: Points that are asked whether they lie below the support, and so deep, m.
+_ASKED, _BELOW = 20_000, 0.02
 #: A thing has a colour when so many of its pixels have it.
 _COLORED = 0.5
 
@@ -50,6 +52,14 @@ class Found:
         count = np.bincount(inside, minlength=1)
         best = int(count.argmax())
         return best if 2 * count[best] >= len(inside) else 0
+
+    def hidden(self) -> float:
+        """Return the share of the points that the support would hide from a camera, 0 to 1: a sign of other axes."""
+        support, points = self.segmentation.support, self.frame.points.reshape(-1, 3)
+        points = points[np.isfinite(points[:, 2])]
+        points = points[:: max(1, len(points) // _ASKED)].astype(np.float64)
+        below = points[points @ support.normal + support.offset < -_BELOW]
+        return float(np.count_nonzero(support.outside(below) < -_BELOW)) / max(len(points), 1)
 
     def as_json(self) -> dict[str, Any]:
         """Return what was found; m, pixels, degrees of the colour wheel as names."""
@@ -172,8 +182,8 @@ def _depths(z: NDArray[np.float32], limits: DepthLimits) -> str:
         return "no pixel has a depth"
     first, last = (float(v) for v in np.percentile(there, (5.0, 95.0)))
     share = float(np.mean((there >= limits.near) & (there <= limits.far)))
-    near = f" --near {max(math.floor(first * 100.0), 1) / 100.0:g}" if first < limits.near else ""
-    far = f" --far {math.ceil(last * 10.0) / 10.0:g}" if last > limits.far else ""
+    near = f" --near {max(math.floor(first * 95.0), 1) / 100.0:g}" if first < limits.near else ""
+    far = f" --far {math.ceil(last * 10.5) / 10.0:g}" if last > limits.far else ""
     text = f"depths are {first:.3g} to {last:.3g} m (5th to 95th percentile), of which {share:.0%} lie within"
     return f"{text} --near {limits.near:g} and --far {limits.far:g}" + (f": type{near}{far}" if near or far else "")
 

@@ -17,6 +17,8 @@ from openarm_common.types import Array, Floats, Ints
 _LONGEST, _MOST_PIXELS = 4096, 4_000_000
 #: Rays that are asked for the distance of their neighbours.
 _ASKED = 5000
+#: Places on a grid differ so much from whole numbers, rms; those of strewn points by 0.29.
+_ON_GRID = 0.1
 #: Pixels grow by this until fewer than this share of those that are surrounded have no point.
 _STEP, _HOLES = 1.15, 0.02
 #: A ray further aside (tangent) belongs to no image.
@@ -42,14 +44,16 @@ def fitting_camera(points: Array) -> Intrinsics:
     pitch = max(pitch, float(np.sqrt(np.prod(extent) / _MOST_PIXELS)), 1e-5)
     while True:
         # pixels lie where points of a grid do
-        at = np.round((rays - rays[0]) / pitch).astype(np.int64)
+        place = (rays - rays[0]) / pitch
+        at = np.round(place).astype(np.int64)
         first, last = at.min(axis=0), at.max(axis=0)
         width, height = (int(n) for n in last - first + 1)
         filled = np.zeros((height, width), np.uint8)
         filled[at[:, 1] - first[1], at[:, 0] - first[0]] = 1
         around = cv2.boxFilter(filled, cv2.CV_16S, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
         holes = int(np.count_nonzero((filled == 0) & (around >= 5)))
-        if holes <= _HOLES * int(filled.sum()) or max(width, height) < 16:
+        grid = float(np.sqrt(np.mean((place - at) ** 2))) < _ON_GRID
+        if grid or holes <= _HOLES * int(filled.sum()) or max(width, height) < 16:
             break
         pitch *= _STEP
     cx, cy = (float(v) for v in -rays[0] / pitch - first)

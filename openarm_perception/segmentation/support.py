@@ -87,10 +87,10 @@ class Support:
         facing = rays @ self.normal
         there = rays * np.where(facing < -1e-9, -self.offset / np.minimum(facing, -1e-9), np.inf)[:, None]
         cut = known & (share < 1.0) & (height <= _LOW) & np.isfinite(there).all(axis=1)
-        goes_on = self._outside(np.where(cut[:, None], there, 0.0)) <= _ROUND
-        return float(np.mean((self._outside(points) <= 0.0) | (cut & goes_on)))
+        goes_on = self.outside(np.where(cut[:, None], there, 0.0)) <= _ROUND
+        return float(np.mean((self.outside(points) <= 0.0) | (cut & goes_on)))
 
-    def _outside(self, points: Array) -> Array:
+    def outside(self, points: Array) -> Array:
         """Return how far points (n, 3) are beyond the outline of what is seen of the plane, m (n,); negative inside."""
         flat, along = points @ self.axes, np.roll(self.hull, -1, axis=0) - self.hull
         turn = 1.0 if float(np.sum(self.hull[:, 0] * along[:, 1] - self.hull[:, 1] * along[:, 0])) > 0.0 else -1.0

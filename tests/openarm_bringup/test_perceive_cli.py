@@ -74,6 +74,51 @@ def test_a_cloud_gives_the_same(files, tmp_path, capsys):
     assert b["centre"] == pytest.approx(a["centre"], abs=5e-4)
 
 
+def flat(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The points of a cloud (1, n, 3) in another order, and their colours."""
+    cloud = read_pcd(path)
+    order = np.random.default_rng(0).permutation(cloud.points[..., 0].size)
+    assert cloud.rgb is not None
+    return cloud.points.reshape(-1, 3)[order][None], cloud.rgb.reshape(-1, 3)[order][None]
+
+
+def test_clouds_that_are_no_images_give_the_same(files, tmp_path, capsys):
+    """In any order; in millimetres with x forward; and from above, with z up and the origin elsewhere."""
+    _, known = answer_of(capsys, "perceive", str(tmp_path / "a.pcd"))
+    points, rgb = flat(tmp_path / "a.pcd")
+    path = tmp_path / "b.pcd"
+    write_pcd(path, Cloud(points, rgb, None))
+    code, answer = answer_of(capsys, "perceive", str(path))
+    assert (code, answer["clusters"]) == (0, known["clusters"])
+    assert "projected into one of 160x120" in answer["message"]
+    body = points @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], np.float32) * 1000.0
+    write_pcd(path, Cloud(body, rgb, None))
+    assert "--unit mm" in answer_of(capsys, "perceive", str(path))[1]["message"]
+    assert "--cloud-frame body" in answer_of(capsys, "perceive", str(path), "--unit", "mm")[1]["message"]
+    _, answer = answer_of(capsys, "perceive", str(path), "--unit", "mm", "--cloud-frame", "body")
+    (one,) = answer["clusters"]
+    assert one["size"] == pytest.approx(known["clusters"][0]["size"], abs=1e-3)
+    up = points * np.float32((1, -1, -1)) + np.float32((0.5, -0.2, 1.1))
+    write_pcd(path, Cloud(up, rgb, None))
+    code, answer = answer_of(capsys, "perceive", str(path), "--cloud-frame", "base")
+    (one,) = answer["clusters"]
+    assert (answer["frame"], one["color"]) == ("base", "red")
+    assert one["centre"] == pytest.approx([0.5, -0.2, 1.1 - DISTANCE + HEIGHT / 2], abs=0.005)
+    assert one["size"] == pytest.approx(known["clusters"][0]["size"], abs=0.01)
+    assert "looks down from" in answer["message"]
+    code, answer = answer_of(capsys, "perceive", str(path), "--cloud-frame", "base", "--pose", files[3])
+    assert (code, "expected none" in answer["message"]) == (2, True)
+
+
+def test_what_would_be_seen_through_the_table_is_said(files, tmp_path, capsys):
+    """A cloud with z up, near enough to its z axis, looks like one of a camera that is below the table."""
+    points, rgb = flat(tmp_path / "a.pcd")
+    write_pcd(tmp_path / "b.pcd", Cloud(points * np.float32((1, -1, -1)) + np.float32((0, 0, 1.3)), rgb, None))
+    _, answer = answer_of(capsys, "perceive", str(tmp_path / "b.pcd"))
+    assert answer["clusters"] == []
+    assert "below that plane: where z is up type --cloud-frame base" in answer["message"]
+
+
 def test_a_pose_gives_the_base_frame_and_a_background_what_is_new(files, tmp_path, capsys):
     (tmp_path / "pose.txt").write_text("1 0 0 0.3\n0 -1 0 0\n0 0 -1 1.1\n0 0 0 1\n")
     pose = ("--depth-scale", "0.0001", "--pose", str(tmp_path / "pose.txt"))
@@ -99,7 +144,11 @@ def test_a_pose_gives_the_base_frame_and_a_background_what_is_new(files, tmp_pat
         (("{c}", "{z}", "--info", "{k}", "--near", "2", "--far", "1"), 2, "near"),
         (("{c}", "{z}", "--info", "{k}", "--pose", "{k}"), 1, "four rows"),
         (("{c}", "{z}", "--info", "{k}", "--depth-scale", "0.0001", "--out", "{k}"), 2, "no folder"),
-        (("{c}", "{z}", "--info", "{k}", "--depth-scale", "0.00001"), 1, "no plane"),
+        (("{c}", "{z}", "--info", "{k}", "--depth-scale", "0.00001"), 1, "of which 0% lie within"),
+        (("{c}", "{z}", "--info", "{k}", "--depth-scale", "0.00001"), 1, "type --near 0.06"),
+        (("{c}", "{z}", "--info", "{k}"), 1, "depths are 7 to 7 m (5th to 95th percentile), of which 0%"),
+        (("{c}", "{z}", "--info", "{k}"), 1, "within --near 0.1 and --far 3: type --far 7.4"),
+        (("{p}", "--far", "0.5"), 1, "type --far 0.8"),
         (("{k}.pcd",), 1, "can't read"),
     ],
 )
