@@ -3,10 +3,10 @@
 
     python -m benchmarks.fuzz [--inputs N] [--seed S] [--only bags,maps,…]
 
-Alters sound files (bags and what is in them, maps, YAML, JSON, archives of samples, networks, robots, poses), and sends
-hostile messages, requests, goals and parameters to all nodes of the graph in one process. Each input has to be accepted
-or refused with an OpenArmError of one sentence. Exit code 1 at a raw error, a hang, a process that died, or an input
-that needs more than 512 MiB.
+Alters sound files (bags and what is in them, maps, clouds, YAML, JSON, archives of samples, networks, robots, poses),
+and sends hostile messages, requests, goals and parameters to all nodes of the graph in one process. Each input has to
+be accepted or refused with an OpenArmError of one sentence. Exit code 1 at a raw error, a hang, a process that died, or
+an input that needs more than 512 MiB.
 
     raw      errors of any other type, a node that ended or was silent for 2 s, texts of more than 4000 characters
     hangs    inputs that took longer than 20 s

@@ -40,6 +40,8 @@ _PINHOLE = 1.0
 _FAR_M, _NEAR_M = 100.0, 0.02
 #: Share of the points that lie before a camera, if they are its own; and smallest cloud.
 _AHEAD, _LEAST = 0.9, 100
+#: Points that are asked for their distance, and whether they lie before the camera.
+_ASKED = 100_000
 #: Height of the camera over the highest point of a cloud with z up, m; more over a wide one.
 _ABOVE = 1.0
 _T_OPTICAL_BODY = se3.make([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -139,7 +141,7 @@ def intrinsics_of(points: Points) -> Intrinsics:
 def _metres(points: Points, unit: Unit, path: Path) -> Points:
     """Return points in metres; refuse those that can hardly be."""
     scale = np.float32(1e-3 if unit == "mm" else 1.0)
-    distance = np.linalg.norm(points[..., :3].reshape(-1, 3)[:: max(1, points.size // 300_000)], axis=1)
+    distance = np.linalg.norm(_some(points), axis=1)
     distance = distance[np.isfinite(distance)]
     if len(distance) < _LEAST:
         raise refused(path, f"has {len(distance)} points of finite numbers", f"at least {_LEAST}")
@@ -153,10 +155,15 @@ def _metres(points: Points, unit: Unit, path: Path) -> Points:
     return points * scale
 
 
+def _some(points: Points) -> Array:
+    """Return some of the points (n, 3)."""
+    return points.reshape(-1, 3)[:: max(1, points.size // (3 * _ASKED))].astype(np.float64)
+
+
 def _require_ahead(points: Points, axes: Axes, path: Path) -> None:
     """Refuse points that are not before the camera, and say what fits."""
-    p = points.reshape(-1, 3)[:: max(1, points.size // 300_000)].astype(np.float64)
-    p = p[np.isfinite(p).all(axis=1)]
+    p = _some(points)
+    p = p[np.isfinite(p[:, 0])]
     ways = {"optical": p, "body": p @ _T_OPTICAL_BODY[:3, :3].T} if axes == "optical" else {"body": p}
     fit = [name for name, q in ways.items() if _ahead(q)]
     if axes in fit:
@@ -184,7 +191,8 @@ def _from_above(cloud: Cloud, like: CloudFrame | None) -> CloudFrame:
         middle = (finite.min(axis=0) + finite.max(axis=0)) / 2.0
         above = max(_ABOVE, float(np.ptp(finite[:, :2], axis=0).max()) / WIDEST)
         T = se3.make(np.diag([1.0, -1.0, -1.0]), (middle[0], middle[1], finite[:, 2].max() + above))
-    seen = se3.apply(se3.inverse(T), points.astype(np.float64)).astype(np.float32).reshape(cloud.points.shape)
+    with np.errstate(over="ignore"):
+        seen = se3.apply(se3.inverse(T), points.astype(np.float64)).astype(np.float32).reshape(cloud.points.shape)
     lens = None if like is None else like.frame.intrinsics
     frame = _projected(Cloud(seen, cloud.rgb, cloud.label), UNLIMITED, lens)
     size = f"{frame.intrinsics.width}x{frame.intrinsics.height}"

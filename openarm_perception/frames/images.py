@@ -107,9 +107,6 @@ def metres(counts: DepthImage, scale: float | None) -> Floats:
     return counts.astype(np.float32) * np.float32(unit_scale(counts) if scale is None else scale)
 
 
-    return lens
-
-
 def read_pose(path: Path) -> Array:
     """Read the pose (4, 4) of the optical frame in a frame whose z points up: four rows of four numbers, m.
 

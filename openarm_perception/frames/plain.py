@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ def read_npy(path: Path) -> Cloud:
     """
     try:
         array: Any = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError, TypeError, OverflowError, MemoryError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, TokenError, OverflowError, MemoryError) as error:
         raise refused(path, "is no array of numbers, or is cut short", "a .npy file of numpy.save") from error
     shape = getattr(array, "shape", ())
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or len(shape) not in (2, 3):
