@@ -57,7 +57,7 @@ def perceive(
         background: Depth image, or cloud, of the empty table or box from the same place.
         near: Nearest depth that counts, m.
         far: Farthest depth that counts, m.
-        unit: Of the coordinates of a cloud.
+        unit: Unit of the coordinates of a cloud.
         cloud_frame: Axes of a cloud: optical (x right, y down, z forward) or body (x forward, z up), each of the camera
             that took it, or base (z up, the origin anywhere), which is looked at from above.
         timeout: Longest wait for a camera of the running graph, s.

@@ -202,7 +202,7 @@ def _from_above(cloud: Cloud, like: CloudFrame | None) -> CloudFrame:
 
 
 def _projected(cloud: Cloud, limits: DepthLimits, lens: Intrinsics | None) -> Frame:
-    points = cloud.points.reshape(-1, 3).astype(np.float64)
+    points = np.ascontiguousarray(cloud.points).reshape(-1, 3)
     if lens is None:
         within = points[(points[:, 2] >= limits.near) & (points[:, 2] <= limits.far)]
         lens = fitting_camera(within if len(within) >= _LEAST else points[points[:, 2] > 0.0])
