@@ -126,7 +126,7 @@ def perceive(
     message = f"{count} on a plane with {found.segmentation.support.share:.0%} of what was measured"
     if cloud is not None and cloud.note:
         message += f"; {cloud.note}"
-        if found.hidden() > _HIDDEN:
+        if cloud.T_base_camera is None and found.hidden() > _HIDDEN:
             message += (
                 f"; {found.hidden():.0%} of the points lie below that plane: where z is up type --cloud-frame base"
             )

@@ -12,8 +12,8 @@ from openarm_common.kernels import kernel
 from openarm_common.types import Floats, Ints
 from openarm_perception.geometry.depth import Points
 
-#: Largest image, pixels each way and in all.
-_LONGEST, _MOST_PIXELS = 4096, 4_000_000
+#: Largest image, pixels each way, in all and for each point.
+_LONGEST, _MOST_PIXELS, _EACH = 4096, 2_000_000, 16
 #: Rays in the middle of the image, and those of them that are asked for the distance of their neighbours.
 _MIDDLE, _ASKED = 300_000, 5000
 #: Places on a grid differ so much from whole numbers, rms; those of strewn points by 0.29.
@@ -41,7 +41,7 @@ def fitting_camera(points: Points) -> Intrinsics:
     distance, _ = KDTree(middle).query(middle[:: max(1, len(middle) // _ASKED)], k=min(5, len(middle)))
     extent = np.ptp(rays, axis=0)
     pitch = max(float(np.median(distance[:, -1])) if len(rays) > 1 else 0.0, float(extent.max()) / (_LONGEST - 1))
-    pitch = max(pitch, float(np.sqrt(np.prod(extent) / _MOST_PIXELS)), 1e-5)
+    pitch = max(pitch, float(np.sqrt(np.prod(extent) / min(_MOST_PIXELS, _EACH * len(rays)))), 1e-5)
     while True:
         # pixels lie where points of a grid do
         place = (rays - rays[0]) / pitch
