@@ -46,13 +46,14 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Header:
-    """What a header says: form, elements, and `num_cols` and `num_rows`, 0 where it does not say them."""
+    """What a header says: form, elements, `num_cols` and `num_rows`, 0 without them, and the grid of that size."""
 
     order: str
     ascii: bool
     elements: tuple[_Element, ...]
     width: int
     height: int
+    grid: _Element | None
 
 
 def read_ply(path: Path) -> Cloud:
@@ -71,8 +72,7 @@ def read_ply(path: Path) -> Cloud:
     tables: dict[str, dict[str, NDArray[Any]]] = {}
     grid: Ints | None = None
     for element in head.elements:
-        of_cells = element.name == "range_grid" and element.count == head.width * head.height > 0
-        if of_cells and element.lists and "vertex" in tables:
+        if head.grid is element and "vertex" in tables:
             grid = _grid(data[at:], head, element, path)
             break
         columns, size = _columns(data[at:], head, element, path)
@@ -142,8 +142,17 @@ def _header(data: Bytes, path: Path) -> tuple[_Header, int]:
     if len(made) > _MOST_ELEMENTS or any(len(one.properties) > _MOST_PROPERTIES for one in made):
         text = f"at most {_MOST_ELEMENTS} elements of {_MOST_PROPERTIES} properties"
         raise refused(path, f"has {len(made)} elements", text)
-    last = max(i for i, one in enumerate(made) if one.name in ("vertex", "camera", "range_grid"))
-    return _Header(_FORMS[form], form == "ascii", made[: last + 1], said["num_cols"], said["num_rows"]), found.end()
+    width, height = said["num_cols"], said["num_rows"]
+    # the grid of a single row says nothing, and some announce it without writing it
+    gridded = min(width, height) > 1
+    grids = (one for one in made if one.name == "range_grid" and one.lists and one.count == width * height)
+    grid = next(grids, None) if gridded else None
+    last = max(i for i, one in enumerate(made) if one.name in ("vertex", "camera") or one is grid)
+    space = b"\r\n\t " if form == "ascii" else b""
+    at = found.end()
+    while at < len(data) and data[at] in space:
+        at += 1
+    return _Header(_FORMS[form], form == "ascii", made[: last + 1], width, height, grid), at
 
 
 def _number(word: str, line: str, path: Path) -> int:

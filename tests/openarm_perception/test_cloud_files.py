@@ -101,6 +101,15 @@ def test_a_ply_is_organised_where_it_says_so(tmp_path: Path, form: str) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
+def test_a_grid_of_one_row_is_no_image_and_may_be_missing(tmp_path: Path, form: str) -> None:
+    """Writers announce it and leave it out, or the other way round; and one line is empty before a text."""
+    ply = vertices(Ply(form, "num_cols 6", "num_rows 1"))
+    ply.head.append("element range_grid 6\nproperty list uchar int vertex_indices")
+    ply.data = (b"\n" if form == "ascii" else b"") + ply.data
+    np.testing.assert_array_equal(read_ply(ply.write(tmp_path / "a.ply")).points, POINTS[None])
+
+
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
     ("change", "said"),
     [
