@@ -123,7 +123,11 @@ def perceive(
     found = find(frame, limits, colors, T_base_camera, empty)
     written = () if out is None else found.write(out)
     count = len(found.segmentation.clusters)
-    message = f"{count} on a plane with {found.segmentation.support.share:.0%} of what was measured"
+    first, last = found.depths
+    message = f"{count} on a plane with {found.segmentation.support.share:.0%} of what was measured, {first:.2f} to"
+    message += f" {last:.2f} m away"
+    if hint := found.unit_hint():
+        message += f"; {hint}"
     if cloud is not None and cloud.note:
         message += f"; {cloud.note}"
         if cloud.T_base_camera is None and found.hidden() > _HIDDEN:

@@ -23,6 +23,10 @@ from openarm_perception.segmentation.draw import depth_picture, label_picture, o
 
 #: Points that are asked whether they lie below the support, and so deep, m.
 _ASKED, _BELOW = 20_000, 0.02
+#: Metres of a count of depth by other sensors.
+_UNITS = {0.0001: "D405", 0.0002: "TUM's 5000 a metre", 0.00025: "L515", 0.001: "millimetres"}
+#: Table tops are seen from within these, m.
+_NEAR, _FAR = 0.15, 1.5
 #: A thing has a colour when so many of its pixels have it.
 _COLORED = 0.5
 
@@ -61,12 +65,23 @@ class Found:
         below = points[points @ support.normal + support.offset < -_BELOW]
         return float(np.count_nonzero(support.outside(below) < -_BELOW)) / max(len(points), 1)
 
+    @property
+    def depths(self) -> tuple[float, float]:
+        """The 5th and 95th percentile of the depths that count, m."""
+        first, last = np.nanpercentile(self.frame.points[..., 2], (5.0, 95.0))
+        return float(first), float(last)
+
+    def unit_hint(self) -> str:
+        """Say which other unit of depth would fit, where it is far for a table top; "" where it is not."""
+        return _other_units(self.frame.points[..., 2], self.frame.assumed)
+
     def as_json(self) -> dict[str, Any]:
         """Return what was found; m, pixels, degrees of the colour wheel as names."""
         support = self.segmentation.support
         lens = self.frame.intrinsics
         return {
             "frame": "base" if self.placed else "camera",
+            "depths": [round(v, 4) for v in self.depths],
             "intrinsics": {name: round(float(getattr(lens, name)), 3) for name in ("fx", "fy", "cx", "cy")},
             "support": {
                 "normal": [round(float(v), 5) for v in support.normal], "offset": round(support.offset, 5),
@@ -160,7 +175,8 @@ def find(
     except OpenArmError as error:
         if error.code is not Code.NOTHING_DETECTED:
             raise
-        raise OpenArmError(error.code, f"{error.message}; {_depths(measured, limits)}") from error
+        hints = (_depths(measured, limits), _other_units(measured, frame.assumed))
+        raise OpenArmError(error.code, "; ".join([error.message, *filter(None, hints)])) from error
     rgb = frame.rgb
     if rgb is None:
         return Found(frame, result, (), ("",) * len(result.clusters), T_base_camera is not None)
@@ -186,6 +202,26 @@ def _depths(z: NDArray[np.float32], limits: DepthLimits) -> str:
     far = f" --far {math.ceil(last * 10.5) / 10.0:g}" if last > limits.far else ""
     text = f"depths are {first:.3g} to {last:.3g} m (5th to 95th percentile), of which {share:.0%} lie within"
     return f"{text} --near {limits.near:g} and --far {limits.far:g}" + (f": type{near}{far}" if near or far else "")
+
+
+def _other_units(z: NDArray[np.float32], count: float | None) -> str:
+    """Say which units of other sensors would put depths (h, w) on a table top; "" where they are, or the unit is known.
+
+    Args:
+        z: Depths by the assumed unit, m.
+        count: Metres of a count that were assumed; None where that is known.
+    """
+    there = z[np.isfinite(z)]
+    if count is None or not there.size or (middle := float(np.median(there))) <= _FAR:
+        return ""
+    fit = [
+        f"--depth-scale {unit:g} ({whose}) makes it {middle * unit / count:.2g} m"
+        for unit, whose in _UNITS.items()
+        if unit < count and _NEAR <= middle * unit / count <= _FAR
+    ]
+    if not fit:
+        return ""
+    return f"the median depth is {middle:.3g} m at {count:g} m a count: where that is wrong, {', '.join(fit)}"
 
 
 def _png(picture: Any) -> bytes:

@@ -34,11 +34,13 @@ class Frame:
         points: (h, w, 3) float32 organised, optical frame, m; NaN where nothing was measured.
         rgb: (h, w, 3) uint8; None without colour.
         intrinsics: Of both.
+        assumed: Metres of a count of depth, where nobody has said it; None where that is known.
     """
 
     points: Points
     rgb: Bytes | None
     intrinsics: Intrinsics
+    assumed: float | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -66,8 +68,9 @@ def read_frame(color: Path, depth: Path, info: Path, depth_scale: float | None, 
     to_rgb = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
     rgb = cv2.cvtColor(to_bytes(picture), to_rgb[1 if picture.ndim == 2 else picture.shape[2]])
     lens = read_lens(info, (rgb.shape[1], rgb.shape[0]))
-    points = read_depth(depth, lens, depth_scale, limits)
-    return Frame(points, lens.rectified(rgb.astype(np.uint8, copy=False)), lens.intrinsics)
+    z = _read_counts(depth, lens)
+    points = _organised(z, lens, depth_scale, limits)
+    return Frame(points, lens.rectified(rgb.astype(np.uint8, copy=False)), lens.intrinsics, assumed(z, depth_scale))
 
 
 def read_depth(path: Path, lens: Lens, depth_scale: float | None, limits: DepthLimits) -> Points:
@@ -82,12 +85,20 @@ def read_depth(path: Path, lens: Lens, depth_scale: float | None, limits: DepthL
     Raises:
         OpenArmError: BAD_IMAGE, for another image or another size; INVALID_ARGUMENT, for a scale.
     """
+    return _organised(_read_counts(path, lens), lens, depth_scale, limits)
+
+
+def _organised(counts: DepthImage, lens: Lens, depth_scale: float | None, limits: DepthLimits) -> Points:
+    return Deprojector(limits).organised(lens.rectified_depth(metres(counts, depth_scale)), lens.intrinsics)
+
+
+def _read_counts(path: Path, lens: Lens) -> DepthImage:
     z, k = _read_image(path), lens.intrinsics
     if z.dtype.name not in ("uint16", "float32") or z.ndim != 2:
         raise _refused(path, f"has {_channels(z)}", "a depth image: one channel of 16 bits, or of floats")
     if z.shape != (k.height, k.width):
         raise _refused(path, f"is {z.shape[1]}x{z.shape[0]} pixels", f"{k.width}x{k.height}, as the colour image")
-    return Deprojector(limits).organised(lens.rectified_depth(metres(z, depth_scale)), k)
+    return z
 
 
 def metres(counts: DepthImage, scale: float | None) -> Floats:
@@ -105,6 +116,11 @@ def metres(counts: DepthImage, scale: float | None) -> Floats:
             Code.INVALID_ARGUMENT, f"depth scale is {scale:g} m a count; expected 0.000001 .. 1, such as 0.001"
         )
     return counts.astype(np.float32) * np.float32(unit_scale(counts) if scale is None else scale)
+
+
+def assumed(counts: DepthImage, scale: float | None) -> float | None:
+    """Return the metres of a count that `metres` assumes; None where the scale is given."""
+    return unit_scale(counts) if scale is None else None
 
 
 def read_pose(path: Path) -> Array:

@@ -14,7 +14,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.images import AnyImage, depth_image, lens_from_info, rgb_image
 from openarm_common.types import Array
-from openarm_perception.frames.images import Frame, metres
+from openarm_perception.frames.images import Frame, assumed, metres
 from openarm_perception.geometry.align import aligned
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
@@ -204,7 +204,7 @@ class FrameBuilder:
                 )
             z = lens.rectified_depth(_fitting("depth", z, lens))
         points = Deprojector(self._limits).organised(z, lens.intrinsics)
-        return Frame(points, np.ascontiguousarray(rgb), lens.intrinsics)
+        return Frame(points, np.ascontiguousarray(rgb), lens.intrinsics, assumed(counts, self._scale))
 
     def _lens(self, image: str, info: str) -> Lens:
         return lens_from_info(self._newest[info], rectified=_untransported(image).endswith(_RECTIFIED))

@@ -196,7 +196,7 @@ def test_what_does_not_fit_is_named_and_dropped(bench) -> None:
         ),
         ("colour image is 320x240", "color", lambda cam, t: array_to_image(cam.rgb[::2, ::2], "rgb8", cam.frame, t)),
         (
-            "depth encoding 'mono8' is not supported; valid: 16UC1, 32FC1",
+            "depth encoding 'mono8' is not supported; valid: 16UC1, mono16, 32FC1",
             "depth",
             lambda cam, t: array_to_image(np.zeros((480, 640), np.uint8), "mono8", cam.frame, t),
         ),

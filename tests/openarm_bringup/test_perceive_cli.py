@@ -163,3 +163,30 @@ def test_the_cloud_is_left_as_it_is(files, tmp_path, capsys):
     before = read_pcd(tmp_path / "a.pcd").points.copy()
     answer_of(capsys, "perceive", str(tmp_path / "a.pcd"), "--far", "0.68")
     assert np.array_equal(read_pcd(tmp_path / "a.pcd").points, before)
+
+
+@pytest.mark.parametrize("count", [0.0001, 0.0002])
+@pytest.mark.requirement("M-02")
+def test_depth_in_another_unit_is_noticed(files, tmp_path, capsys, count):
+    """A D405 counts in 0.1 mm, the sets of TUM in 0.2 mm: read as mm the table is metres away."""
+    z = cv2.imread(files[1], cv2.IMREAD_UNCHANGED).astype(float) * 1e-4 * (0.4 if count == 0.0001 else 1.0)
+    cv2.imwrite(str(tmp_path / "counts.png"), np.round(z / count).astype(np.uint16))
+    argv = (files[0], str(tmp_path / "counts.png"), *files[2:])
+    _, answer = answer_of(capsys, "perceive", *argv)
+    assert f"--depth-scale {count:g}" in str(answer["message"])
+    code, answer = answer_of(capsys, "perceive", *argv, "--depth-scale", str(count))
+    assert code == 0
+    assert "--depth-scale" not in str(answer["message"])
+    assert answer["depths"] == pytest.approx(np.percentile(z, (5, 95)), abs=1e-3)
+
+
+@pytest.mark.requirement("M-02")
+def test_floats_in_millimetres_are_noticed(files, tmp_path, capsys):
+    z = cv2.imread(files[1], cv2.IMREAD_UNCHANGED).astype(np.float32) * np.float32(0.1)
+    cv2.imwrite(str(tmp_path / "z.tiff"), z)
+    argv = (files[0], str(tmp_path / "z.tiff"), *files[2:])
+    code, answer = answer_of(capsys, "perceive", *argv)
+    assert code == 1
+    assert "--depth-scale 0.001 (millimetres) makes it 0.7 m" in str(answer["message"])
+    code, answer = answer_of(capsys, "perceive", *argv, "--depth-scale", "0.001")
+    assert (code, len(answer["clusters"])) == (0, 1)
