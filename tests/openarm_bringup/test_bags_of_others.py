@@ -81,6 +81,7 @@ def rosbag2(path: Path, storage: StoragePlugin, stamps: Sequence[int], qos: Sequ
 
 
 # --- SQLite
+@pytest.mark.requirement("M-07")
 @pytest.mark.parametrize("alone", [True, False])
 def test_a_database_without_metadata_is_read_alone_and_in_its_folder(tmp_path: Path, alone: bool) -> None:
     written = rosbag2(tmp_path / "bag", StoragePlugin.SQLITE3, range(9), [from_profile(QOS_LATCHED)])

@@ -26,7 +26,7 @@ from openarm_common.errors import Code
 from tests.openarm_calibration import foreign_files as files
 from tests.refusals import refuses
 
-pytestmark = pytest.mark.requirement("P-28", "A-36")
+pytestmark = pytest.mark.requirement("P-28", "A-36", "M-05")
 KNOWN = files.truth("to_hand", 8)
 A, C = KNOWN.A, KNOWN.C
 

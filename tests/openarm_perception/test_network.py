@@ -115,7 +115,7 @@ def test_classes_of_one_name_are_one_class(tmp_path, classes) -> None:
 
 
 @pytest.mark.parametrize("layout", READ)
-@pytest.mark.requirement("N-15", "B-38")
+@pytest.mark.requirement("N-15", "B-38", "M-03")
 def test_every_layout_gives_the_same_boxes_of_the_same_classes(tmp_path, layout: str) -> None:
     output, more = READ[layout]
     found = make(tmp_path, output, **more).detect(IMAGE)
