@@ -241,6 +241,7 @@ def test_target_files_of_kalibr_are_read() -> None:
     ids=lambda b: b.kind,
 )
 @pytest.mark.requirement("A-42")
+@pytest.mark.requirement("M-04")
 def test_a_far_board_of_which_the_paper_ends_close_by_is_found_in_a_large_picture(board: Board) -> None:
     """Of 15 to 60 px a square, without softened edges, before something dark; always the same answer."""
     optics, rng = Intrinsics(1920, 1080, 1371.0, 1371.0, 959.5, 539.5), np.random.default_rng(3)

@@ -129,6 +129,7 @@ def four_axes(setup, count: int = 14) -> files.Truth:
 
 @pytest.mark.parametrize("setup", SETUPS)
 @pytest.mark.requirement("A-41")
+@pytest.mark.requirement("M-06")
 def test_an_arm_of_four_axes_tells_five_numbers_of_the_mount_and_takes_the_sixth(setup) -> None:
     known = four_axes(setup)
     found = solve_pairs(known.pairs)

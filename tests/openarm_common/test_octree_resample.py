@@ -54,6 +54,7 @@ def scene(seed: int, n: int) -> np.ndarray:
     return states
 
 
+@pytest.mark.requirement("M-09")
 @settings(max_examples=40, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
