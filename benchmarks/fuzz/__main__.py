@@ -3,10 +3,10 @@
 
     python -m benchmarks.fuzz [--inputs N] [--seed S] [--only bags,maps,…]
 
-Alters sound files (bags and what is in them, maps, clouds, YAML, JSON, archives of samples, networks, robots, poses),
-and sends hostile messages, requests, goals and parameters to all nodes of the graph in one process. Each input has to
-be accepted or refused with an OpenArmError of one sentence. Exit code 1 at a raw error, a hang, a process that died, or
-an input that needs more than 512 MiB.
+Alters sound files (bags and what is in them, maps, clouds, images and intrinsics, YAML, JSON, archives of samples,
+networks, robots, poses), and sends hostile messages, requests, goals and parameters to all nodes of the graph in one
+process. Each input has to be accepted or refused with an OpenArmError of one sentence. Exit code 1 at a raw error, a
+hang, a process that died, or an input that needs more than 512 MiB.
 
     raw      errors of any other type, a node that ended or was silent for 2 s, texts of more than 4000 characters
     hangs    inputs that took longer than 20 s
@@ -29,8 +29,8 @@ from benchmarks.fuzz.judge import Tally
 
 #: Share of all inputs, by kind.
 SHARES = {
-    "bags": 12, "contents": 2, "maps": 12, "yaml": 20, "json": 6, "npz": 8, "onnx": 4, "robots": 8, "poses": 8,
-    "messages": 16, "requests": 6, "goals": 3, "parameters": 3,
+    "bags": 12, "contents": 2, "maps": 12, "clouds": 8, "pictures": 6, "yaml": 20, "json": 6, "npz": 8, "onnx": 4,
+    "robots": 8, "poses": 8, "messages": 16, "requests": 6, "goals": 3, "parameters": 3,
 }  # fmt: skip
 
 

@@ -44,6 +44,8 @@ def decode_picture(data: bytes, where: str) -> NDArray[Any]:
         raise _bad(f"{where} is no image that can be read, expected PNG or JPEG: {type(error).__name__}") from error
     if width * height > MOST_PIXELS:
         raise _bad(f"{where} is {width}x{height} pixels, expected at most {MOST_PIXELS}")
+    if data.startswith(_PNG) and not _is_whole(data):
+        raise _bad(f"{where} is damaged: a part of the PNG is longer than all of it; copy it again")
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
@@ -51,6 +53,15 @@ def decode_picture(data: bytes, where: str) -> NDArray[Any]:
     if picture is None or picture.shape[:2] != (height, width):  # pyright: ignore[reportUnnecessaryComparison]
         raise _bad(f"{where} is damaged, or of a form that is not read; expected PNG or JPEG")
     return picture
+
+
+def _is_whole(png: bytes) -> bool:
+    """Whether no part of a PNG says that it is longer than what follows: memory is taken for what it says."""
+    at = 8
+    while at + 12 <= len(png):
+        (length,) = struct.unpack_from(">I", png, at)
+        at += 12 + length
+    return at <= len(png)
 
 
 def decode_depth(data: bytes, encoding: str, where: str) -> NDArray[np.uint16] | Floats:

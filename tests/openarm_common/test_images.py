@@ -176,6 +176,13 @@ def test_compressed_colour_is_read() -> None:
     refused("which is depth", rgb_image, compressed("16UC1; compressedDepth png", png))
 
 
+def test_a_png_whose_parts_say_that_they_are_huge_takes_no_memory() -> None:
+    png = bytearray(cv2.imencode(".png", RED)[1].tobytes())
+    at = png.index(b"IDAT") - 4
+    png[at : at + 4] = struct.pack(">I", 2**31 - 8)
+    refused("longer than all of it", rgb_image, compressed("png", bytes(png)))
+
+
 def inverse(depth: NDArray[np.float32], a: float, b: float) -> NDArray[np.uint16]:
     """Quantise depth as compressed_depth_image_transport does."""
     return np.where(np.isfinite(depth), np.rint(a / depth + b), 0).astype(np.uint16)
