@@ -175,9 +175,11 @@ def test_the_verdict_has_held_out_errors_and_reasons(session) -> None:
     solution = solve(problem)
     good = assess(problem, solution, stored=known.X)
     assert good.grade == "pass", good.reasons
-    sigma = good.figures["accuracy_translation"]
-    grades = [assess(problem, solution, Limits(translation=sigma / ratio)).grade for ratio in (0.9, 2.0, 5.0)]
+    repeatable, accurate = good.figures["sigma_translation"], good.figures["accuracy_translation"]
+    limits = (accurate / 0.9, accurate / 5.0, repeatable / 5.0)  # what the lens leaves open is a warning at most
+    grades = [assess(problem, solution, Limits(translation=limit)).grade for limit in limits]
     assert grades == ["pass", "warn", "fail"]
+    assert accurate / 5.0 > repeatable / 3.0
     assert good.figures["leave_one_out"] < 0.5e-3
     assert 0.0 < good.figures["five_fold_px"] < 0.5
     assert abs(good.figures["scale"] - 1.0) < 0.003
