@@ -139,10 +139,17 @@ def _of_librealsense(rays: Array, d: Array) -> Array:
 @lru_cache(maxsize=8)
 def _maps(lens: Lens) -> tuple[Floats, Floats]:
     """Return column and row (h, w) in a picture of the lens for each pixel of the pinhole camera."""
-    k = lens.intrinsics
-    x, y = np.meshgrid(*(axis.astype(np.float64) for axis in k.rays))
-    at = lens.distorted(np.column_stack([x.ravel(), y.ravel()])).astype(np.float32)
-    return at[:, 0].reshape(k.height, k.width), at[:, 1].reshape(k.height, k.width)
+    k, d = lens.intrinsics, np.array(lens.coefficients)
+    if lens.model in _LIBREALSENSE:
+        x, y = np.meshgrid(*(axis.astype(np.float64) for axis in k.rays))
+        at = lens.distorted(np.column_stack([x.ravel(), y.ravel()])).astype(np.float32)
+        return at[:, 0].reshape(k.height, k.width), at[:, 1].reshape(k.height, k.width)
+    K, size = k.matrix, (k.width, k.height)
+    if lens.fisheye:
+        maps = cv2.fisheye.initUndistortRectifyMap(K, d[:4], np.eye(3), K, size, cv2.CV_32FC1)
+    else:
+        maps = cv2.initUndistortRectifyMap(K, d, np.eye(3), K, size, cv2.CV_32FC1)
+    return maps[0].astype(np.float32, copy=False), maps[1].astype(np.float32, copy=False)
 
 
 def lens_of(size: Sequence[int], k: Sequence[float], model: str, coefficients: Sequence[float], where: str) -> Lens:
