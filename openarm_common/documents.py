@@ -61,7 +61,7 @@ def read_document(path: Path) -> Any:
             return [parse_json(line, f"{path}:{k + 1}", Code.CONFIG_INVALID) for k, line in enumerate(lines)]
         return parse_json(text, str(path), Code.CONFIG_INVALID)
     # FileStorage has a directive that is no YAML, and tags for its matrices
-    plain = re.sub(r"\A%YAML:1\.0\s*(\n---)?", "", text).replace("!!opencv-matrix", "")
+    plain = re.sub(r"\A%YAML[: ]1\.\d\s*(\n---)?", "", text).replace("!!opencv-matrix", "")
     parts = [part for part in re.split(r"^---\s*$", plain, flags=re.MULTILINE) if part.strip()]
     if len(parts) < 2:  # else it is a stream of messages, as ROS prints them
         return parse_yaml(parts[0] if parts else "", str(path))

@@ -12,8 +12,8 @@ from openarm_common.errors import Code, OpenArmError
 
 #: Share of a cloud that a camera does not see below a table, but for noise.
 _HIDDEN = 0.005
-#: Columns of the table, wider than most terminals: its numbers are all there.
-_WIDE = 150
+#: Columns of the table, wider than terminals: nothing of it is cut.
+_WIDE = 400
 
 
 def perceive(
@@ -29,8 +29,8 @@ def perceive(
     background: Path | None = None,
     near: float = 0.1,
     far: float = 3.0,
-    unit: Literal["m", "mm"] = "m",
-    cloud_frame: Literal["optical", "body", "base"] = "optical",
+    unit: Literal["m", "cm", "mm"] = "m",
+    cloud_frame: Literal["optical", "opengl", "body", "base", "base_y"] = "optical",
     domain: Domain = None,
     timeout: float = 10.0,
 ) -> Outcome:
@@ -44,7 +44,7 @@ def perceive(
             floats); or a cloud (.pcd, .ply, .npy, .xyz); or a bag (folder of rosbag2, .mcap, .db3); or nothing, for a
             camera of the running graph.
         info: Intrinsics of images, with distortion: YAML of a CameraInfo, of OpenCV or Kalibr, JSON, or three rows of
-            three numbers. Of a bag or graph: topic of the colour image's CameraInfo.
+            three numbers. Of a bag or graph: topic of the colour image's CameraInfo, or such a file.
         color: Topic of the colour image in a bag or graph, also compressed; by the names of drivers when not given.
         depth: Topic of the depth image in a bag or graph, likewise.
         camera: Namespace of the camera in a bag or graph, such as /camera/camera, or a part of it; the only one when
@@ -58,8 +58,9 @@ def perceive(
         near: Nearest depth that counts, m.
         far: Farthest depth that counts, m.
         unit: Unit of the coordinates of a cloud.
-        cloud_frame: Axes of a cloud: optical (x right, y down, z forward) or body (x forward, z up), each of the camera
-            that took it, or base (z up, the origin anywhere), which is looked at from above.
+        cloud_frame: Axes of a cloud: optical (x right, y down, z forward), opengl (y up, z backward, as the RealSense
+            Viewer writes it) or body (x forward, z up), each of the camera that took it; or base (z up) or base_y (y
+            up), the origin anywhere, which are looked at from above.
         timeout: Longest wait for a camera of the running graph, s.
     """
     from openarm_bringup.bags.files import is_recording
@@ -78,6 +79,9 @@ def perceive(
             Code.INVALID_ARGUMENT, f"--near {near:g} and --far {far:g} m; expected 0 < near < far <= 1000"
         )
     limits = DepthLimits(near=near, far=far)
+    for file in files:
+        if not file.exists():
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no file or bag {file}")
     cloud = None
     bag = len(files) == 1 and not is_cloud(files[0]) and (files[0].is_dir() or is_recording(files[0]))
     of_topics = bag or not files
@@ -88,7 +92,8 @@ def perceive(
     if of_topics:
         from openarm_bringup.ros.camera_frame import CameraChoice, frame_of_bag, frame_of_graph
 
-        chosen = CameraChoice(camera, color, depth, info, depth_scale)
+        lens = read_lens(Path(info)) if info and Path(info).is_file() else None
+        chosen = CameraChoice(camera, color, depth, "" if lens else info, lens, depth_scale)
         if not bag:
             join_graph(domain)
         frame = frame_of_bag(files[0], chosen, start) if bag else frame_of_graph(chosen, timeout)
@@ -117,8 +122,8 @@ def perceive(
     if out is not None:
         try:
             out.mkdir(parents=True, exist_ok=True)
-        except (FileExistsError, NotADirectoryError) as error:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"--out {out} is no folder") from error
+        except OSError as error:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"--out {out} is no folder to write to: {error}") from error
     colors = ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
     found = find(frame, limits, colors, T_base_camera, empty)
     written = () if out is None else found.write(out)
@@ -147,7 +152,7 @@ def _table(rows: list[tuple[str, ...]]) -> str:
     table = Table(box=None, pad_edge=False)
     for name in ("#", "colour", "shape", "edges [mm]", "x y z [m]", "pixels"):
         table.add_column(name, no_wrap=True)
-    table.add_column("why it is no prism", no_wrap=True, overflow="ellipsis")
+    table.add_column("why it is no prism", no_wrap=True)
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     lines = as_text(table, _WIDE).splitlines() if rows else []

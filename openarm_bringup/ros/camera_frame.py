@@ -16,12 +16,16 @@ from openarm_bringup.bags.bag import open_bag
 from openarm_bringup.bags.ros.messages import contents, message_of, messages_of
 from openarm_bringup.messages import interface
 from openarm_bringup.ros.peer import Frames
+from openarm_common.camera.lens import Lens
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import ContextNode
 from openarm_common.ros.node import QOS_STATIC_TF
 from openarm_perception.frames.images import Frame
 from openarm_perception.geometry.depth import UNLIMITED
 from openarm_perception.ros.frames import CameraTopics, FrameBuilder, camera_topics
+
+#: Frames of a bag that are tried, where the first ones can't be read.
+_FAULTS = 30
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,7 @@ class CameraChoice:
         color: Topic of the colour image; "": found by the names that drivers use.
         depth: Topic of the depth image, likewise.
         info: Topic of the CameraInfo of the colour image, likewise.
+        lens: Lens of the colour camera; None: its CameraInfo says it.
         depth_scale: Metres of a count of depth; None as for `metres`.
     """
 
@@ -40,15 +45,17 @@ class CameraChoice:
     color: str = ""
     depth: str = ""
     info: str = ""
+    lens: Lens | None = None
     depth_scale: float | None = None
 
     def topics(self, kinds: Mapping[str, str]) -> CameraTopics:
         """Return its topics among those that there are, types by topic; errors as `camera_topics`."""
-        return camera_topics(kinds, self.camera, color=self.color, depth=self.depth, info=self.info)
+        known = self.lens is not None
+        return camera_topics(kinds, self.camera, color=self.color, depth=self.depth, info=self.info, known=known)
 
     def builder(self, topics: CameraTopics, frames: Frames) -> FrameBuilder:
         """Return a builder of frames of these topics."""
-        return FrameBuilder(topics, UNLIMITED, self.depth_scale, frames.between)
+        return FrameBuilder(topics, UNLIMITED, self.depth_scale, self.lens, frames.between)
 
 
 class _Camera(ContextNode):
@@ -131,8 +138,17 @@ def frame_of_bag(path: Path, chosen: CameraChoice, start_s: float) -> Frame:
                 for record in bag.records([info]):
                     builder.take(record.topic, message_of(bag, record))
                     break
+            faults: list[OpenArmError] = []
             for record in bag.records([topic for topic in topics if topic], start_s):
-                frame = builder.take(record.topic, message_of(bag, record))
+                try:
+                    frame = builder.take(record.topic, message_of(bag, record))
+                except OpenArmError as error:  # a later one may be whole
+                    faults.append(error)
+                    frame = None
                 if frame is not None:
                     return frame
+                if len(faults) >= _FAULTS:
+                    break
+            if faults:
+                raise faults[0]
     raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} has no frame from {start_s:g} s on: {builder.missing()}")

@@ -8,6 +8,7 @@ is of rays that are scaled already: 0.06 px in the corner of a D455. Pixels.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,6 +31,8 @@ MODELS: dict[str, tuple[int, ...]] = {
     "brown_conrady": (5,), "inverse_brown_conrady": (5,), "modified_brown_conrady": (5,),
     "equidistant": (4,), "fisheye": (4,), "kannala_brandt4": (4, 5),
 }  # fmt: skip
+#: Margin of an image in which no principal point lies, as a share of its sides: K is of another resolution then.
+_MARGIN = 0.05
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt4")
 _LIBREALSENSE = ("inverse_brown_conrady", "modified_brown_conrady")
 #: Marks that were moved and then distorted again must come back to this, px.
@@ -170,6 +173,14 @@ def lens_of(size: Sequence[int], k: Sequence[float], model: str, coefficients: S
     optics = Intrinsics(int(size[0]), int(size[1]), float(k[0]), float(k[4]), float(k[2]), float(k[5]))
     if fault := optics.fault():
         raise OpenArmError(Code.BAD_IMAGE, f"{where} is not calibrated: {fault}")
+    for c, side, name in ((optics.cx, optics.width, "cx"), (optics.cy, optics.height, "cy")):
+        if not _MARGIN < c / side < 1.0 - _MARGIN:
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"{where} has {name} = {c:g} of {optics.width}x{optics.height} pixels, at the border or outside of the"
+                f" image; expected about its middle. It would be of images of about {2 * optics.cx:.0f}x"
+                f"{2 * optics.cy:.0f} pixels: give K of this resolution",
+            )
     if abs(float(k[1])) > 1e-6 * optics.fx:
         raise OpenArmError(Code.BAD_IMAGE, f"{where} has a skew of {float(k[1]):g} px, expected 0")
     values = tuple(float(value) for value in coefficients)
@@ -177,7 +188,7 @@ def lens_of(size: Sequence[int], k: Sequence[float], model: str, coefficients: S
         raise OpenArmError(Code.BAD_IMAGE, f"{where} has distortion coefficients that are not finite")
     if not any(values):
         return Lens(optics)
-    name = model.lower()
+    name = re.sub(r"[\s-]+", "_", model.strip().lower()) or "plumb_bob"
     if name not in MODELS or len(values) not in MODELS[name]:
         listed = ", ".join(f"{one} ({' or '.join(map(str, counts))})" for one, counts in MODELS.items())
         raise OpenArmError(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -23,6 +24,11 @@ _DISTORTION = (
     "distortion_coeffs",
 )  # fmt: skip
 _MODEL = ("distortion_model", "model")
+#: Coefficients with names of their own.
+_FLAT, _FLAT_FISHEYE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), ("k1", "k2", "k3", "k4")
+#: Words for a projection that is no pinhole's, and ours: OpenCV's, and those of other programs.
+_FISHEYE = re.compile(r"fisheye|equidistant|kannala|kb4?$", re.IGNORECASE)
+_PINHOLES = re.compile(r"pinhole|perspective|opencv|plumb|brown|radtan|^$", re.IGNORECASE)
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
 _EXPECTED = (
     "image_width, image_height, camera_matrix (or K, or fx, fy, cx and cy), and distortion_coefficients (or D) with"
@@ -44,7 +50,7 @@ def read_lens(path: Path, size: tuple[int, int] | None = None) -> Lens:
     try:
         if (numbers := _of_text(path)) is not None:
             return _lens(numbers, size, (), "", path)
-        entries = _entries(read_document(path))
+        entries = _entries(read_document(path), size)
         said = _size(entries)
         if said is None and size is None:
             raise KeyError("image_width")
@@ -53,13 +59,11 @@ def read_lens(path: Path, size: tuple[int, int] | None = None) -> Lens:
                 Code.CONFIG_INVALID,
                 f"{path} is of images of {said[0]}x{said[1]} pixels; expected {size[0]}x{size[1]}, as these are",
             )
-        d = _listed(_named(entries, _DISTORTION, ()))
-        model = _named(entries, _MODEL, "plumb_bob")
-        return _lens(_matrix(entries), said or size, d, str(model).rpartition(".")[2], path)
+        return _lens(_matrix(entries), said or size, *_distortion(entries), path)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        why = f"no {error.args[0]}" if isinstance(error, KeyError) else brief(str(error))
         raise OpenArmError(
-            Code.CONFIG_INVALID,
-            f"{path} has no intrinsics of a camera: {type(error).__name__}: {brief(str(error))}; expected {_EXPECTED}",
+            Code.CONFIG_INVALID, f"{path} has no intrinsics of a camera: {why}; expected {_EXPECTED}"
         ) from error
 
 
@@ -73,30 +77,69 @@ def _lens(k: list[float], size: tuple[int, int] | None, d: list[float] | tuple[(
     return lens_of(size, k, model, d, str(path))
 
 
+def _distortion(entries: Mapping[str, Any]) -> tuple[list[float], str]:
+    """Return the coefficients and their model.
+
+    Raises:
+        ValueError: For a projection that is neither a pinhole's nor a fisheye's.
+    """
+    projection = str(entries.get("camera_model", ""))
+    fisheye = bool(entries.get("fisheye_model")) or _FISHEYE.search(projection) is not None
+    if not (fisheye or _PINHOLES.search(projection)):
+        raise ValueError(f"its camera_model is {projection!r}, expected pinhole or fisheye")
+    d = _listed(_named(entries, _DISTORTION, ()))
+    flat = _FLAT_FISHEYE if fisheye else _FLAT
+    if not d and "k1" in entries:
+        d = [float(entries.get(name, 0.0)) for name in flat]
+        d = d if fisheye or any(d[5:]) else d[:5]
+    model = str(_named(entries, _MODEL, "equidistant" if fisheye else "plumb_bob"))
+    return d, model.rpartition(".")[2]
+
+
 def _of_text(path: Path) -> list[float] | None:
-    """Return the numbers of a text that has only nine, in rows of three, or four; None for another file."""
+    """Return the numbers of a text that is a matrix, or fx, fy, cx and cy; None for another file."""
     if path.suffix in (".npz", ".npy", ".xml", ".json"):
         return None
     try:
         cells = read_cells(path)
     except OpenArmError:
         return None
-    if [len(row) for row in cells.rows] not in ([3, 3, 3], [4]) or cells.header:
+    rows = [[number(cell) for cell in row] for row in cells.rows]
+    shape = (len(rows), len(rows[0]) if rows else 0)
+    if cells.header or len({len(row) for row in rows}) != 1 or any(None in row for row in rows):
         return None
-    numbers = [number(cell) for row in cells.rows for cell in row]
-    return None if None in numbers else cast("list[float]", numbers)
+    if shape in ((3, 3), (3, 4), (4, 4)):
+        rows = [row[:3] for row in rows[:3]]
+    elif shape not in ((1, 9), (1, 4), (4, 1)):
+        return None
+    return cast("list[float]", [value for row in rows for value in row])
 
 
-def _entries(document: Any) -> dict[str, Any]:
-    """Return the entries of the mapping that has the matrix, with those around it; names in lower case."""
+def _entries(document: Any, size: tuple[int, int] | None) -> dict[str, Any]:
+    """Return the entries of the mapping that has the matrix, with those around it; names in lower case.
+
+    Of several cameras the one that is of this size.
+
+    Raises:
+        TypeError: For a document without names.
+        ValueError: For several cameras.
+    """
     if isinstance(document, list):  # messages, as ROS prints them
         document = next(iter(cast("list[Any]", document)), None)
     if not isinstance(document, dict):
-        raise TypeError("it has no names")
+        raise TypeError("no names")
     outer = _lowered(cast("dict[Any, Any]", document))
     names = {*_MATRIX, "fx"} - {"matrix"}
-    inner = (_lowered(cast("dict[Any, Any]", value)) for value in outer.values() if isinstance(value, dict))
-    return outer | next((one for one in inner if not names.isdisjoint(one)), {})
+    if not names.isdisjoint(outer):
+        inner = _named(outer, _MATRIX, None)
+        return outer | (_lowered(cast("dict[Any, Any]", inner)) if isinstance(inner, dict) and "fx" in inner else {})
+    inside = {key: _lowered(cast("dict[Any, Any]", one)) for key, one in outer.items() if isinstance(one, dict)}
+    cameras = {key: one for key, one in inside.items() if not names.isdisjoint(one)}
+    of_size = {key: one for key, one in cameras.items() if _size(one) == size}
+    fitting = of_size if len(cameras) > 1 and of_size else cameras
+    if len(fitting) > 1:
+        raise ValueError(f"the intrinsics of several cameras: {', '.join(fitting)}; put those of one into a file")
+    return outer | next(iter(fitting.values()), {})
 
 
 def _lowered(entries: Mapping[Any, Any]) -> dict[str, Any]:

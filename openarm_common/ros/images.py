@@ -8,6 +8,7 @@ ndarray costs 187 ms for a 640×480 depth image, an `array.array` 0.2 ms); data 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Any, cast
 
 import cv2
@@ -173,10 +174,23 @@ def lens_from_info(info: CameraInfo, *, rectified: bool = False) -> Lens:
     Raises:
         OpenArmError: BAD_IMAGE, when the camera is not calibrated (K is zero), or has another distortion model.
     """
-    where, size, p = f"camera_info of {info.header.frame_id!r}", (info.width, info.height), info.p
+    where, p = f"camera_info of {info.header.frame_id!r}", info.p
+    size = (
+        (info.roi.width or info.width) // max(info.binning_x, 1),
+        (info.roi.height or info.height) // max(info.binning_y, 1),
+    )
     if rectified and p[0] > 0.0:
-        return lens_of(size, (p[0], 0.0, p[2], 0.0, p[5], p[6], 0.0, 0.0, 1.0), "", (), where)
-    return lens_of(size, list(info.k), info.distortion_model, list(info.d), where)
+        return lens_of(size, _in_part((p[0], 0.0, p[2], 0.0, p[5], p[6], 0.0, 0.0, 1.0), info), "", (), where)
+    return lens_of(size, _in_part(list(info.k), info), info.distortion_model, list(info.d), where)
+
+
+def _in_part(k: Sequence[float], info: CameraInfo) -> list[float]:
+    """Return K of the images that binning and region of interest leave of the full resolution, as REP 104 has it."""
+    across, down = max(info.binning_x, 1), max(info.binning_y, 1)
+    scale = np.array([[1.0 / across, 0.0, -info.roi.x_offset / across], [0.0, 1.0 / down, -info.roi.y_offset / down]])
+    out = np.array(k, np.float64).reshape(3, 3)
+    out[:2] = scale[:, :2] @ out[:2] + scale[:, 2:] * out[2]
+    return out.ravel().tolist()
 
 
 def depth_of(depth: AnyImage, info: CameraInfo) -> tuple[NDArray[np.uint16] | Floats, Lens]:

@@ -67,9 +67,12 @@ def _colors(fields: Mapping[str, NDArray[np.generic]], shape: tuple[int, int]) -
     if packed is not None:
         four = np.ascontiguousarray(packed).view(np.uint8).reshape(*shape, 4)
         return np.ascontiguousarray(four[..., 2::-1])
+    fields = {name.lower(): values for name, values in fields.items()}
     names = next((names for names in _COLORS if set(names) <= set(fields)), None)
     if names is None:
         return None
     whole = all(fields[name].dtype.kind != "f" for name in names)
     rgb = np.nan_to_num(np.stack([fields[name].astype(np.float32) for name in names], axis=-1).reshape(*shape, 3))
+    if whole and rgb.max(initial=0.0) > 255.0:  # of 16 bits, as LAS has them
+        rgb = rgb / np.float32(257.0)
     return np.clip(rgb if whole or rgb.max() > 1.0 else rgb * np.float32(255.0), 0, 255).astype(np.uint8)

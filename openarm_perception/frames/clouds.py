@@ -22,13 +22,15 @@ from openarm_perception.frames.ply import read_ply
 from openarm_perception.frames.projection import WIDEST, fitting_camera, project
 from openarm_perception.geometry.depth import UNLIMITED, Deprojector, DepthLimits, Points
 
-Unit = Literal["m", "mm"]
-#: Axes of a cloud: of a camera (x right, y down, z forward), of a body or sensor (x forward, z up: REP-103), both with
-#: the sensor at their origin, or of anything that stands on the ground (z up, the origin anywhere).
-Axes = Literal["optical", "body", "base"]
+Unit = Literal["m", "cm", "mm"]
+#: Axes of a cloud with the sensor at their origin: of a camera (x right, y down, z forward), of one in OpenGL (x right,
+#: y up, z backward), of a body (x forward, z up: REP-103); or of anything that stands on the ground, the origin
+#: anywhere: z up, or y up.
+Axes = Literal["optical", "opengl", "body", "base", "base_y"]
+_METRES: Mapping[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 _READERS: Mapping[str, Callable[[Path], Cloud]] = {
-    ".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy, ".xyz": read_xyz,
+    ".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy, ".xyz": read_xyz, ".xyzrgb": read_xyz, ".asc": read_xyz,
 }  # fmt: skip
 #: What is a cloud, too, and what it is.
 _FOREIGN = {
@@ -44,7 +46,13 @@ _AHEAD, _LEAST = 0.9, 100
 _ASKED = 100_000
 #: Height of the camera over the highest point of a cloud with z up, m; more over a wide one.
 _ABOVE = 1.0
-_T_OPTICAL_BODY = se3.make([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+#: Axes of the optical frame in those of a camera's cloud, and what lies forward there.
+_CAMERAS: Mapping[Axes, tuple[Array, str]] = {
+    "optical": (np.eye(3), "z"),
+    "opengl": (np.diag([1.0, -1.0, -1.0]), "-z"),
+    "body": (np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "x"),
+}
+_R_Z_UP_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +97,10 @@ def read_cloud(
         raise refused(path, f"is a {kind} file", f"{', '.join(_READERS)}; {how}")
     cloud = reader(path)
     cloud = Cloud(_metres(cloud.points, unit, path), cloud.rgb, cloud.label)
-    if axes == "base":
-        return _from_above(cloud, like)
-    if axes == "body":
-        cloud = Cloud(cloud.points @ _T_OPTICAL_BODY[:3, :3].T.astype(np.float32), cloud.rgb, cloud.label)
+    if axes not in _CAMERAS:
+        return _from_above(cloud if axes == "base" else _turned(cloud, _R_Z_UP_Y_UP), like)
+    _require_ahead(cloud.points, axes, path)
+    cloud = _turned(cloud, _CAMERAS[axes][0])
     why = "is no image"
     if cloud.organised:
         try:
@@ -101,10 +109,13 @@ def read_cloud(
             why = "is the image of no pinhole camera"
         else:
             return CloudFrame(Frame(cloud.points, cloud.rgb, lens), None, "")
-    _require_ahead(cloud.points, axes, path)
     frame = _projected(cloud, limits, None if like is None else like.frame.intrinsics)
     size = f"{frame.intrinsics.width}x{frame.intrinsics.height}"
     return CloudFrame(frame, None, f"the cloud {why}, and was projected into one of {size}, z forward")
+
+
+def _turned(cloud: Cloud, R: Array) -> Cloud:
+    return Cloud(cloud.points @ R.T.astype(np.float32), cloud.rgb, cloud.label)
 
 
 def intrinsics_of(points: Points) -> Intrinsics:
@@ -140,7 +151,7 @@ def intrinsics_of(points: Points) -> Intrinsics:
 
 def _metres(points: Points, unit: Unit, path: Path) -> Points:
     """Return points in metres; refuse those that can hardly be."""
-    scale = np.float32(1e-3 if unit == "mm" else 1.0)
+    scale = np.float32(_METRES[unit])
     distance = np.linalg.norm(_some(points), axis=1)
     distance = distance[np.isfinite(distance)]
     if len(distance) < _LEAST:
@@ -148,10 +159,13 @@ def _metres(points: Points, unit: Unit, path: Path) -> Points:
     middle = float(np.median(distance)) * float(scale)
     if unit == "m" and middle > _FAR_M:
         raise refused(
-            path, f"has half of its points farther than {middle:.0f} m", "metres; of millimetres type --unit mm"
+            path,
+            f"has half of its points farther than {middle:.0f} m",
+            "metres; of millimetres type --unit mm, of centimetres --unit cm",
         )
-    if unit == "mm" and middle < _NEAR_M:
-        raise refused(path, f"has half of its points nearer than {middle * 1e3:.2g} mm", "millimetres; type --unit m")
+    if unit != "m" and middle < _NEAR_M:
+        text = f"has half of its points nearer than {middle * 1e3:.2g} mm by --unit {unit}"
+        raise refused(path, text, "other units; type --unit m")
     return points * scale
 
 
@@ -161,17 +175,16 @@ def _some(points: Points) -> Array:
 
 
 def _require_ahead(points: Points, axes: Axes, path: Path) -> None:
-    """Refuse points that are not before the camera, and say what fits."""
+    """Refuse points that are not before the camera, and say which axes fit."""
     p = _some(points)
     p = p[np.isfinite(p[:, 0])]
-    ways = {"optical": p, "body": p @ _T_OPTICAL_BODY[:3, :3].T} if axes == "optical" else {"body": p}
-    fit = [name for name, q in ways.items() if _ahead(q)]
+    fit = {name: forward for name, (R, forward) in _CAMERAS.items() if _ahead(p @ R.T)}
     if axes in fit:
         return
-    forward, other = ("z", "") if axes == "optical" else ("x", ", where z is forward --cloud-frame optical")
-    instead = "with x forward type --cloud-frame body" if fit else f"where z is up type --cloud-frame base{other}"
-    what = f"is no cloud of a camera that looks along {forward}: too much lies behind it or far aside"
-    raise refused(path, what, f"one; {instead}")
+    ways = [f"with {forward} forward type --cloud-frame {name}" for name, forward in fit.items()]
+    ways += ["where z is up, and no camera at the origin, --cloud-frame base", "where y is up --cloud-frame base_y"]
+    what = f"is no cloud of a camera that looks along {_CAMERAS[axes][1]}: too much lies behind it or far aside"
+    raise refused(path, what, f"one; {', '.join(ways)}")
 
 
 def _ahead(points: Array) -> bool:

@@ -123,7 +123,7 @@ def _header(data: Bytes, path: Path) -> tuple[_Header, int]:
             case ["property", "list", length, kind, name] if elements and {length, kind} <= set(_TYPES):
                 elements[-1][2].append((name, _TYPES[kind], _TYPES[length]))
             case ["property", kind, name] if elements and kind in _TYPES:
-                elements[-1][2].append((name, _TYPES[kind], ""))
+                elements[-1][2].append((name.lower(), _TYPES[kind], ""))
             case ["property", *_]:
                 raise refused(path, f"has the line {brief(line)}", f"a property of the types {', '.join(_TYPES)}")
             case _:

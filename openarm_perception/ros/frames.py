@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -33,10 +35,13 @@ _DEPTH = (
 )  # fmt: skip
 #: What image_transport adds to a topic.
 _TRANSPORTS = ("", "/compressed", "/compressedDepth")
-#: Ends of topics of image_proc, whose images are without distortion while their CameraInfo is that of the lens.
-_RECTIFIED = ("/image_rect", "/image_rect_color", "/rect/image")
-#: Colour and depth of one frame differ by no more, ns.
-_TOGETHER = 20_000_000
+#: Names of images without distortion, while their CameraInfo is that of the lens, as those of image_proc. What a
+#: RealSense calls image_rect_raw is as its CameraInfo says.
+_RECTIFIED = re.compile(r"(^|[/_])rect(ified)?(?!_raw)([/_]|$)")
+#: Names of depth that lies on the colour image already, whatever its frame is called.
+_REGISTERED = re.compile(r"registered|aligned_depth|depth_to_(color|rgb)")
+#: Colour and depth of one frame differ by no more: two images at 15 Hz that are not triggered together, ns.
+_TOGETHER = 35_000_000
 #: Intrinsics of the same image differ by no more, px.
 _SAME_PX = 0.5
 
@@ -51,7 +56,13 @@ class CameraTopics(NamedTuple):
 
 
 def camera_topics(
-    kinds: Mapping[str, str], camera: str = "", *, color: str = "", depth: str = "", info: str = ""
+    kinds: Mapping[str, str],
+    camera: str = "",
+    *,
+    color: str = "",
+    depth: str = "",
+    info: str = "",
+    known: bool = False,
 ) -> CameraTopics:
     """Choose the topics of a camera among those that there are.
 
@@ -61,6 +72,7 @@ def camera_topics(
         color: Topic of the colour image; "": by the names that drivers use.
         depth: Topic of the depth image, likewise.
         info: Topic of the CameraInfo of the colour image, likewise.
+        known: Whether the lens of the colour camera is known, so that no CameraInfo is needed.
 
     Raises:
         OpenArmError: NOTHING_DETECTED, when there is no such camera; INVALID_ARGUMENT, when there are several, or a
@@ -74,13 +86,14 @@ def camera_topics(
                 Code.INVALID_ARGUMENT, f"{option} {topic} is no topic with {' or '.join(types)}; {_listed(kinds)}"
             )
     if color and depth:
-        return _with_infos(CameraTopics(color, depth, info), kinds)
+        return _with_infos(CameraTopics(color, depth, info), kinds, fail=not known)
     cameras = {
         space: _with_infos(CameraTopics(color or its_color, depth or its_depth, info), kinds, fail=False)
         for space in sorted({space for end in (*_COLOR, *_DEPTH) for space in _spaces(kinds, end)})
         if (its_color := color or _first(kinds, space, _COLOR)) and (its_depth := depth or _first(kinds, space, _DEPTH))
     }
-    cameras = {space: topics for space, topics in cameras.items() if topics.info}
+    lacking = [topics for topics in cameras.values() if not (topics.info or known)]
+    cameras = {space: topics for space, topics in cameras.items() if topics.info or known}
     part = camera.strip("/")
     chosen = [f"/{part}"] if f"/{part}" in cameras else [space for space in cameras if part in space]
     if len({cameras[space] for space in chosen}) == 1:
@@ -89,6 +102,8 @@ def camera_topics(
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"several cameras: {', '.join(chosen)}; choose one by --camera, or topics by --color"
         )
+    if lacking:
+        _with_infos(lacking[0], kinds)  # says what is missing
     what = f"no depth camera {camera!r}" if camera else "no depth camera"
     raise OpenArmError(
         Code.NOTHING_DETECTED,
@@ -100,6 +115,8 @@ def camera_topics(
 def _listed(kinds: Mapping[str, str]) -> str:
     images = [topic for topic, kind in sorted(kinds.items()) if kind in (IMAGE, COMPRESSED)]
     infos = [topic for topic, kind in sorted(kinds.items()) if kind == INFO]
+    if clouds := [topic for topic, kind in sorted(kinds.items()) if kind == "sensor_msgs/msg/PointCloud2"]:
+        infos.append(f"(clouds, which are read from files alone: {', '.join(clouds)})")
     return f"image topics: {', '.join(images) or 'none'}; camera_info topics: {', '.join(infos) or 'none'}"
 
 
@@ -128,7 +145,9 @@ def _with_infos(topics: CameraTopics, kinds: Mapping[str, str], *, fail: bool = 
     info = topics.info or of(topics.color)
     if not info and fail:
         raise OpenArmError(
-            Code.NOTHING_DETECTED, f"no camera_info next to {topics.color}; give its topic by --info; {_listed(kinds)}"
+            Code.NOTHING_DETECTED,
+            f"no camera_info next to {topics.color}; give its topic, or a file of its intrinsics, by --info;"
+            f" {_listed(kinds)}",
         )
     own = of(topics.depth)
     return topics._replace(info=info, depth_info="" if own == info else own)
@@ -145,6 +164,7 @@ class FrameBuilder:
         topics: Topics of the camera.
         limits: Depths that count.
         depth_scale: Metres of a count of depth; None is that of ROS: 0.001 of integers, 1 of floats.
+        lens: Lens of the colour camera; None: its CameraInfo says it.
         pose: Returns the pose (4, 4) of the second frame in the first one; None, when it is not known.
     """
 
@@ -153,10 +173,13 @@ class FrameBuilder:
         topics: CameraTopics,
         limits: DepthLimits,
         depth_scale: float | None = None,
+        lens: Lens | None = None,
         pose: Callable[[str, str], Array | None] = lambda _target, _source: None,
     ) -> None:
         self._topics, self._limits, self._scale, self._pose = topics, limits, depth_scale, pose
+        self._given = lens
         self._newest: dict[str, Any] = {}
+        self._nearest_ns = math.inf
 
     def take(self, topic: str, message: AnyImage | CameraInfo) -> Frame | None:
         """Take a message; returns a frame when it completes one.
@@ -169,28 +192,40 @@ class FrameBuilder:
         color, depth = self._newest.get(names.color), self._newest.get(names.depth)
         if color is None or depth is None or any(name not in self._newest for name in self._wanted()):
             return None
-        if abs(stamp_to_ns(color.header.stamp) - stamp_to_ns(depth.header.stamp)) > _TOGETHER:
+        apart_ns = abs(stamp_to_ns(color.header.stamp) - stamp_to_ns(depth.header.stamp))
+        self._nearest_ns = min(self._nearest_ns, apart_ns)
+        if apart_ns > _TOGETHER:
             return None
         return self._frame(color, depth)
 
     def _wanted(self) -> list[str]:
-        return [topic for topic in self._topics if topic]
+        return [topic for topic in self._topics if topic and (topic != self._topics.info or self._given is None)]
 
     def missing(self) -> str:
         """What has not come, for an error."""
         absent = [topic for topic in self._wanted() if topic not in self._newest]
-        return f"nothing on {', '.join(absent)}" if absent else "no colour and depth image of the same time"
+        if absent:
+            return f"nothing on {', '.join(absent)}"
+        return (
+            f"no colour and depth image of the same time: the nearest are {self._nearest_ns * 1e-6:.0f} ms apart,"
+            f" expected {_TOGETHER * 1e-6:.0f} at most; are their clocks the same?"
+        )
 
     def _frame(self, color: AnyImage, depth: AnyImage) -> Frame:
         """Make a frame: without distortion, and with the depth where the colour camera sees it."""
-        lens = self._lens(self._topics.color, self._topics.info)
+        names = self._topics
+        lens = self._lens(names.info, self._given, _RECTIFIED.search(names.color) is not None)
         rgb = lens.rectified(_fitting("colour", rgb_image(color), lens))
         counts = depth_image(depth)
         z = metres(counts, self._scale)
-        own = self._topics.depth_info
-        if own:
-            of_depth = self._lens(self._topics.depth, own)
-            T_color_depth = self._between(color, depth)
+        if own := names.depth_info:
+            raw = self._lens(own, None, False)
+            # depth that is registered to a rectified colour image has its CameraInfo, too
+            on_color = self._given is None and _alike(self._lens(names.info, None, False), raw)
+            plain = _RECTIFIED.search(names.depth) or (on_color and _RECTIFIED.search(names.color))
+            of_depth = self._lens(own, None, True) if plain else raw
+            registered = _alike(lens, of_depth) and _REGISTERED.search(names.depth)
+            T_color_depth = None if registered else self._between(color, depth)
             z = of_depth.rectified_depth(_fitting("depth", z, of_depth))
             if T_color_depth is not None or not _alike(lens, of_depth):
                 pose = np.eye(4) if T_color_depth is None else T_color_depth
@@ -206,8 +241,9 @@ class FrameBuilder:
         points = Deprojector(self._limits).organised(z, lens.intrinsics)
         return Frame(points, np.ascontiguousarray(rgb), lens.intrinsics, assumed(counts, self._scale))
 
-    def _lens(self, image: str, info: str) -> Lens:
-        return lens_from_info(self._newest[info], rectified=_untransported(image).endswith(_RECTIFIED))
+    def _lens(self, info: str, given: Lens | None, rectified: bool) -> Lens:
+        """Return a lens: what is given, or by a CameraInfo."""
+        return given or lens_from_info(self._newest[info], rectified=rectified)
 
     def _between(self, color: AnyImage, depth: AnyImage) -> Array | None:
         """Return the pose of the depth's frame in that of colour; None where they are one."""

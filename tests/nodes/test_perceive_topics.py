@@ -211,6 +211,66 @@ def test_depth_of_another_camera_is_aligned_or_refused(tmp_path, away):
     assert one["centre"][:2] == pytest.approx([0.0, 0.0], abs=0.004)
 
 
+@pytest.mark.parametrize(
+    ("color", "depth"),
+    [
+        ("rgb/image_rect_color", "depth_registered/image_rect_raw"),
+        ("rgb/image_rect_color", "depth_registered/image"),
+        ("qhd/image_color_rect", "qhd/image_depth_rect"),
+        ("rectified", "z"),
+    ],
+)
+@pytest.mark.requirement("M-01")
+def test_rectified_images_are_not_rectified_again(tmp_path, color, depth):
+    """Their CameraInfo has the distortion of the lens: of image_proc, of kinect2_bridge, or named freely."""
+    rgb, z, info = messages(0)
+    info.d, info.distortion_model = [0.3, -0.2, 0.0, 0.0, 0.0], "plumb_bob"
+    names = (f"/c/{color}", f"/c/{depth}")
+    infos = {f"{name.rpartition('/')[0]}/camera_info": info for name in names}
+    write(tmp_path / "bag", {names[0]: rgb, names[1]: z, **infos})
+    check(perceive(tmp_path / "bag", color=names[0], depth=names[1]).data)
+
+
+@pytest.mark.requirement("M-02")
+def test_registered_depth_is_not_moved_again_whatever_its_frame_is_called(tmp_path):
+    color, depth, info = messages(0)
+    depth.header.frame_id = "depth_optical"
+    edge = matrix_to_transform(color.header.frame_id, "depth_optical", se3.make(None, (0.05, 0.0, 0.0)), 0)
+    by_topic = {"/tf_static": TFMessage(transforms=[edge]), "/c/color/image_raw": color, "/c/color/camera_info": info}
+    by_topic |= {"/c/depth_registered/image_raw": depth, "/c/depth_registered/camera_info": info}
+    write(tmp_path / "bag", by_topic)
+    data = perceive(tmp_path / "bag").data
+    check(data)
+    assert data["clusters"][0]["centre"][0] == pytest.approx(0.0, abs=0.002)
+
+
+@pytest.mark.requirement("M-08")
+def test_a_bag_without_camera_info_is_read_with_a_file_of_intrinsics(tmp_path):
+    color, depth, _ = messages(0)
+    write(tmp_path / "bag", {"/c/color/image_raw": color, "/c/depth/image_raw": depth})
+    refused("no camera_info next to /c/color/image_raw; give its topic, or a file", perceive, tmp_path / "bag")
+    (tmp_path / "k.txt").write_text(f"{LENS.fx} {LENS.fy} {LENS.cx} {LENS.cy}")
+    (tmp_path / "k.yaml").write_text(f"width: 160\nheight: 120\nk: {LENS.matrix.ravel().tolist()}\n")
+    check(perceive(tmp_path / "bag", info=str(tmp_path / "k.yaml")).data)
+
+
+@pytest.mark.requirement("M-08")
+def test_a_frame_that_is_damaged_gives_way_to_a_later_one(tmp_path):
+    color, depth, info = messages(0)
+    jpeg = CompressedImage(header=color.header, format="jpeg", data=array.array("B", b"\xff\xd8\xff cut"))
+    later = messages(100_000_000)
+    good = CompressedImage(header=later[0].header, format="jpeg")
+    good.data = array.array("B", cv2.imencode(".jpg", image_to_array(later[0])[..., ::-1])[1].tobytes())
+    names = ("/c/color/image_raw/compressed", "/c/depth/image_raw", "/c/color/camera_info")
+    with BagWriter(tmp_path / "bag", {}) as writer:
+        for topic, kind in zip(names, ("CompressedImage", "Image", "CameraInfo"), strict=True):
+            writer.add_topic(topic, f"sensor_msgs/msg/{kind}", from_profile(QOS_SENSOR))
+        for k, message in enumerate((jpeg, depth, info, good, later[1])):
+            topic = names[{CompressedImage: 0, Image: 1, CameraInfo: 2}[type(message)]]
+            writer.write(topic, k, serialize_message(message))
+    check(perceive(tmp_path / "bag").data)
+
+
 @pytest.mark.requirement("M-02")
 def test_depth_in_another_frame_without_intrinsics_is_refused(tmp_path):
     color, depth, info = messages(0)
@@ -249,5 +309,5 @@ def test_colour_and_depth_of_different_times_make_no_frame():
     builder = FrameBuilder(topics, DepthLimits())
     for topic, message in ((topics.color, color), (topics.info, info), (topics.depth, late)):
         assert builder.take(topic, message) is None
-    assert builder.missing() == "no colour and depth image of the same time"
+    assert builder.missing().startswith("no colour and depth image of the same time: the nearest are 100 ms apart")
     assert builder.take(topics.depth, near) is not None

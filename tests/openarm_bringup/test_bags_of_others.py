@@ -428,6 +428,7 @@ def _archive(kind: str) -> bytes:
         ("a.txt", b"hello", "is not a bag: expected a folder of rosbag2, or a file of MCAP (.mcap) or SQLite (.db3)"),
         ("a.db3", b"", "is empty"),
     ],
+    ids=["zip", "gzip", "xz", "bzip2", "tar", "ply", "renamed", "npy", "no database", "text", "empty"],
 )
 def test_other_files_are_named_by_their_content(tmp_path: Path, name: str, content: bytes, match: str) -> None:
     path = tmp_path / name

@@ -161,6 +161,17 @@ def test_a_board_behind_a_lens_is_found_as_one_without(tmp_path: Path) -> None:
         ("653.8315 0 652.3585\n0\t653.0682 361.8429\n\n0 0 1\n", ()),
         ("653.8315 0 0\n0 653.0682 0\n652.3585 361.8429 1\n", ()),  # by columns
         ("653.8315 653.0682 652.3585 361.8429\n", ()),
+        ("653.8315 0 652.3585 0\n0 653.0682 361.8429 0\n0 0 1 0\n", ()),
+        ("653.8315 0 652.3585 0 653.0682 361.8429 0 0 1\n", ()),
+        ("%YAML 1.2\n---\nimage_width: 1280\nimage_height: 720\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"
+         "   cols: 3\n   dt: d\n   data: [653.8315, 0., 652.3585, 0., 653.0682, 361.8429, 0., 0., 1.]\n", ()),
+        ("fisheye_model: 1\nimage_width: 1280\nimage_height: 720\ncamera_matrix: {rows: 3, cols: 3, data: [653.8315, 0,"
+         " 652.3585, 0, 653.0682, 361.8429, 0, 0, 1]}\ndistortion_coefficients: {rows: 4, cols: 1, data: [-0.02, 0.004,"
+         " -0.003, 0.001]}\n", (-0.02, 0.004, -0.003, 0.001)),  # OpenCV's sample camera_calibration
+        ("fx: 653.8315\nfy: 653.0682\ncx: 652.3585\ncy: 361.8429\nk1: -0.2\nk2: 0.05\np1: 0.001\np2: 0.0\nk3: -0.01\n",
+         (-0.2, 0.05, 0.001, 0.0, -0.01)),
+        ("cam0: {intrinsics: [400, 400, 320, 240], resolution: [640, 480], camera_model: pinhole}\n"
+         "cam1: {intrinsics: [653.8315, 653.0682, 652.3585, 361.8429], resolution: [1280, 720]}\n", ()),
         ('{"width": 1280, "height": 720, "intrinsic_matrix": [653.8315, 0, 0, 0, 653.0682, 0, 652.3585, 361.8429, 1]}',
          ()),  # Open3D's, by columns
     ],
@@ -171,6 +182,7 @@ def test_intrinsics_of_others_are_read(text: str, d: tuple[float, ...], tmp_path
     found = read_lens(path, SIZE)
     assert found.intrinsics == OPTICS
     assert found.coefficients == d
+    assert found.fisheye == ("fisheye" in text or "equidistant" in text)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +190,7 @@ def test_intrinsics_of_others_are_read(text: str, d: tuple[float, ...], tmp_path
     [
         ("", "has no intrinsics"),
         ("- 1", "has no intrinsics"),
-        ("fx: 20", "camera_matrix"),
+        ("fx: 20", "no camera_matrix"),
         ("fx: a\nfy: 1\ncx: 1\ncy: 1", "has no intrinsics"),
         ("fx: .nan\nfy: 1\ncx: 1\ncy: 1", "fx=nan"),
         ("fx: 0\nfy: 21\ncx: 7\ncy: 5", "fx=0"),
@@ -186,8 +198,11 @@ def test_intrinsics_of_others_are_read(text: str, d: tuple[float, ...], tmp_path
         ("width: 640\nheight: 480\nfx: 20\nfy: 21\ncx: 7\ncy: 5", "640x480 pixels; expected 1280x720"),
         ("a: &a [*a]\nb: [", "not valid YAML|no YAML"),
         ("20 0 x\n0 21 5\n0 0 1", "has no intrinsics"),
-        ("fx: 20\nfy: 21\ncx: 7\ncy: 5\nd: [1, 2, 3]", "3 coefficients; models"),
-        ("fx: 20\nfy: 21\ncx: 7\ncy: 5\nd: [1, 2, 3, 4]\ndistortion_model: ftheta", "'ftheta'"),
+        ("fx: 20\nfy: 21\ncx: 640\ncy: 360\nd: [1, 2, 3]", "3 coefficients; models"),
+        ("fx: 20\nfy: 21\ncx: 640\ncy: 360\nd: [1, 2, 3, 4]\ndistortion_model: ftheta", "'ftheta'"),
+        ("fx: 20\nfy: 21\ncx: 640\ncy: 360\ncamera_model: omni", "camera_model is 'omni'"),
+        ("fx: 900\nfy: 900\ncx: 1280\ncy: 720\n", r"cx = 1280 of 1280x720 .* of about 2560x1440 pixels"),
+        ("a: {fx: 900, fy: 900, cx: 640, cy: 360}\nb: {fx: 600, fy: 600, cx: 640, cy: 360}\n", "several cameras: a, b"),
     ],
 )
 def test_other_files_are_no_intrinsics(text: str, said: str, tmp_path: Path) -> None:

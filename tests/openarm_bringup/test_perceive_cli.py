@@ -149,7 +149,7 @@ def test_a_pose_gives_the_base_frame_and_a_background_what_is_new(files, tmp_pat
         (("{c}", "{z}", "--info", "{k}"), 1, "depths are 7 to 7 m (5th to 95th percentile), of which 0%"),
         (("{c}", "{z}", "--info", "{k}"), 1, "within --near 0.1 and --far 3: type --far 7.4"),
         (("{p}", "--far", "0.5"), 1, "type --far 0.8"),
-        (("{k}.pcd",), 1, "can't read"),
+        (("{k}.pcd",), 2, "there is no file or bag"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(files, tmp_path, capsys, argv, exit_code, words):
@@ -190,3 +190,29 @@ def test_floats_in_millimetres_are_noticed(files, tmp_path, capsys):
     assert "--depth-scale 0.001 (millimetres) makes it 0.7 m" in str(answer["message"])
     code, answer = answer_of(capsys, "perceive", *argv, "--depth-scale", "0.001")
     assert (code, len(answer["clusters"])) == (0, 1)
+
+
+@pytest.mark.requirement("M-09")
+@pytest.mark.parametrize(("axes", "R"), [("opengl", np.diag([1.0, -1.0, -1.0])), ("base_y", None)])
+def test_clouds_with_y_up_are_read(files, tmp_path, capsys, axes, R):
+    """As the RealSense Viewer writes them, with z backward; and of something that stands on the ground."""
+    points = read_pcd(tmp_path / "a.pcd").points.reshape(1, -1, 3)
+    if R is None:  # optical: x right, y down the table, z down; the cloud: x right, y up, z towards the viewer
+        R = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    write_pcd(tmp_path / "b.pcd", Cloud((points @ R.T).astype(np.float32), None, None))
+    code, answer = answer_of(capsys, "perceive", str(tmp_path / "b.pcd"))
+    assert (code, f"--cloud-frame {axes}" in str(answer["message"])) == (1, True)
+    code, answer = answer_of(capsys, "perceive", str(tmp_path / "b.pcd"), "--cloud-frame", axes)
+    assert code == 0
+    (one,) = answer["clusters"]
+    assert one["size"] == pytest.approx([0.06, 0.08, 0.05], abs=0.01)
+
+
+def test_no_number_of_the_table_is_cut(files, capsys):
+    assert cli.run(["perceive", *files, "--depth-scale", "0.0001"]) == 0
+    assert "…" not in capsys.readouterr().out
+
+
+def test_a_folder_that_cannot_be_written_is_named(files, capsys):
+    code, answer = answer_of(capsys, "perceive", *files, "--depth-scale", "0.0001", "--out", "/proc/none")
+    assert (code, "--out /proc/none is no folder to write to" in str(answer["message"])) == (2, True)

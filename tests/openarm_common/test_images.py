@@ -87,6 +87,22 @@ def test_images_of_image_proc_have_the_intrinsics_of_p() -> None:
     assert (found.straight, found.intrinsics.fx) == (True, 400.0)
 
 
+def test_binning_and_region_leave_the_lens_of_the_images_that_come() -> None:
+    info = info_from_intrinsics(Intrinsics(640, 480, 600.0, 602.0, 318.0, 241.0), "c", 0)
+    info.binning_x = info.binning_y = 2
+    assert lens_from_info(info).intrinsics == Intrinsics(320, 240, 300.0, 301.0, 159.0, 120.5)
+    info.binning_x = info.binning_y = 0
+    info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 200, 100, 240, 300
+    assert lens_from_info(info).intrinsics == Intrinsics(240, 300, 600.0, 602.0, 118.0, 141.0)
+
+
+@pytest.mark.parametrize(("name", "ours"), [("Inverse Brown Conrady", "inverse_brown_conrady"), ("", "plumb_bob")])
+def test_names_of_models_may_be_written_otherwise(name: str, ours: str) -> None:
+    info = info_from_intrinsics(Intrinsics.from_fovy(640, 480, 60.0), "c", 0)
+    info.distortion_model, info.d = name, [0.1, 0.0, 0.0, 0.0, 0.0]
+    assert lens_from_info(info).model == ours
+
+
 RED = np.zeros((4, 6, 3), np.uint8)
 RED[..., 0], RED[:, 3:, 1] = 200, 90
 

@@ -241,7 +241,7 @@ def test_axes_and_unit_are_those_that_are_asked_for_and_others_are_named(write: 
     refused("x forward type --cloud-frame body", read_cloud, write(body), LIMITS)
     turned = read_cloud(write(body), LIMITS, axes="body").frame
     np.testing.assert_allclose(turned.points, plain.points, atol=1e-5)
-    refused("z is forward --cloud-frame optical", read_cloud, write(points), LIMITS, axes="body")
+    refused("with z forward type --cloud-frame optical", read_cloud, write(points), LIMITS, axes="body")
     refused("of millimetres type --unit mm", read_cloud, write(points * 1000.0), LIMITS)
     np.testing.assert_allclose(
         read_cloud(write(points * 1000.0), LIMITS, unit="mm").frame.points, plain.points, atol=1e-4
@@ -253,7 +253,7 @@ def test_a_cloud_with_z_up_is_seen_from_above(write: Write) -> None:
     x, y = np.meshgrid(np.arange(-0.4, 0.4, 0.005), np.arange(1.0, 1.6, 0.005))
     z = np.where((np.abs(x) < 0.1) & (np.abs(y - 1.3) < 0.1), 0.5, 0.4)
     flat = np.stack([x, y, z], axis=-1).reshape(1, -1, 3)
-    refused("z is up type --cloud-frame base", read_cloud, write(flat), LIMITS)
+    refused("where z is up, and no camera at the origin, --cloud-frame base", read_cloud, write(flat), LIMITS)
     read = read_cloud(write(flat), LIMITS, axes="base")
     assert read.T_base_camera is not None
     again = read.frame.points.astype(np.float64) @ read.T_base_camera[:3, :3].T + read.T_base_camera[:3, 3]
@@ -281,3 +281,17 @@ def test_other_files_are_named_with_a_way_out(tmp_path: Path, write: Write) -> N
     refused("can't be read|can't read", read_cloud, tmp_path / "none.ply", LIMITS)
     (tmp_path / "empty.ply").touch()
     refused("is empty", read_cloud, tmp_path / "empty.ply", LIMITS)
+
+
+@pytest.mark.requirement("M-09")
+def test_colours_of_16_bits_and_names_in_capitals_are_read(tmp_path: Path) -> None:
+    """As of LAS files that were converted."""
+    properties = [*((axis, "float") for axis in "XYZ"), *((name, "ushort") for name in ("Red", "Green", "Blue"))]
+    file = Ply("binary_little_endian").element(
+        "vertex",
+        properties,
+        [[*point, *(int(c) * 257 for c in color)] for point, color in zip(POINTS, RGB, strict=True)],
+    )
+    cloud = read_ply(file.write(tmp_path / "a.ply"))
+    assert cloud.rgb is not None
+    assert np.array_equal(cloud.rgb.reshape(-1, 3), RGB)
