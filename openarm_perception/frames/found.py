@@ -23,8 +23,9 @@ from openarm_perception.segmentation.draw import depth_picture, label_picture, o
 
 #: Points that are asked whether they lie below the support, and so deep, m.
 _ASKED, _BELOW = 20_000, 0.02
-#: Metres of a count of depth by other sensors.
-_UNITS = {0.0001: "D405", 0.0002: "TUM's 5000 a metre", 0.00025: "L515", 0.001: "millimetres"}
+#: Metres of a count of depth by other sensors, of integers; and of floats that are no metres.
+_UNITS = {0.0001: "D405", 0.0002: "TUM's 5000 a metre", 0.00025: "L515"}
+_OF_FLOATS = {0.001: "millimetres"}
 #: Table tops are seen from within these, m.
 _NEAR, _FAR = 0.15, 1.5
 #: A thing has a colour when so many of its pixels have it.
@@ -175,7 +176,7 @@ def find(
     except OpenArmError as error:
         if error.code is not Code.NOTHING_DETECTED:
             raise
-        hints = (_depths(measured, limits), _other_units(measured, frame.assumed))
+        hints = (_other_units(measured, frame.assumed), _depths(measured, limits))
         raise OpenArmError(error.code, "; ".join([error.message, *filter(None, hints)])) from error
     rgb = frame.rgb
     if rgb is None:
@@ -216,8 +217,8 @@ def _other_units(z: NDArray[np.float32], count: float | None) -> str:
         return ""
     fit = [
         f"--depth-scale {unit:g} ({whose}) makes it {middle * unit / count:.2g} m"
-        for unit, whose in _UNITS.items()
-        if unit < count and _NEAR <= middle * unit / count <= _FAR
+        for unit, whose in (_OF_FLOATS if count == 1.0 else _UNITS).items()
+        if _NEAR <= middle * unit / count <= _FAR
     ]
     if not fit:
         return ""
