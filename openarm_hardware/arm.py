@@ -17,6 +17,8 @@ from openarm_common.motors.frames import Status
 from openarm_hardware.axis import MotorAxis
 from openarm_hardware.settings import Settings
 
+#: Gains of an arm with a motor that lost a turn rise so many times slower.
+_CAREFUL = 10.0
 #: A motor that is not on after so long does not switch on, s.
 _ENABLE_S = 1.0
 #: The frame is repeated after so many cycles.
@@ -44,6 +46,8 @@ class Phase(IntEnum):
     OFF = 9
 
 
+#: In these, it is not known how many turns its motors have lost: their positions may be wrong.
+UNPLACED = frozenset({Phase.LOOKING, Phase.REFUSED})
 #: In these, motors are on and commanded.
 ON = frozenset({Phase.ENABLING, Phase.RAMPING, Phase.FOLLOWING, Phase.HELD, Phase.DAMPED})
 
@@ -70,7 +74,7 @@ class ArmMachine:
         self._since_ns = 0
         #: Its motors are on and damped while it looks: it was reset.
         self._sinks = False
-        #: A reset was asked for, so that errors of motors may be cleared.
+        #: A reset was asked for: errors of motors may be cleared, and where the arm is was looked at.
         self._clears = False
         #: Its motors were switched on here.
         self._was_on = False
@@ -123,8 +127,9 @@ class ArmMachine:
         if phase in (Phase.RAMPING, Phase.FOLLOWING, Phase.HELD):
             return [motor.frame() for motor in self.motors]
         if phase is Phase.ENABLING:
-            off = frames.enable if again else frames.refresh
-            return [m.frame() if m.status == Status.ENABLED else off(m.axis.id) for m in self.motors]
+            on = [motor.status == Status.ENABLED for motor in self.motors]
+            off = MotorAxis.enable_frame if again else MotorAxis.refresh_frame
+            return [motor.frame() if is_on else off(motor) for motor, is_on in zip(self.motors, on, strict=True)]
         if phase is Phase.OFF:
             return [frames.disable(motor.axis.id) for motor in self.motors] if again and self._was_on else []
         return [self._question(motor, again=again) for motor in self.motors]
@@ -154,7 +159,6 @@ class ArmMachine:
             self._become(Phase.FOLLOWING, "", now_ns)
         elif self.phase in (Phase.DAMPED, Phase.REFUSED):
             self._sinks = self._sinks or self.phase is Phase.DAMPED
-            self._last.clear()
             self._clears = True
             for motor in self.motors:
                 motor.forget()
@@ -190,7 +194,9 @@ class ArmMachine:
         if self.phase is Phase.REFUSED:
             return
         if silent := [motor for motor in self.motors if not motor.seen]:
-            self.text = f"no reply of {_named(silent)}; is the arm's power on, its bus up?"
+            self.text = (
+                f"no reply of {_named(silent)}; is the arm's power on, its bus up? `openarm hardware scan` says more"
+            )
             return
         if unread := [motor for motor in self.motors if len(motor.registers) < 3]:
             errors = [motor.fault for motor in unread if motor.broken]
@@ -198,7 +204,8 @@ class ArmMachine:
             return
         for motor in self.motors:
             last = self._last.get(motor.axis.joint)
-            why = motor.scaled or (motor.fault if motor.broken else "") or motor.misplaced(last)
+            why = motor.scaled or (motor.fault if motor.broken else "") or motor.place(last)
+            why = why or (motor.misplaced(last) if last is not None and not self._clears else "")
             if why:
                 self._become(Phase.REFUSED, why, now_ns)
                 return
@@ -215,6 +222,7 @@ class ArmMachine:
             self.text = f"the client commands {far[0].axis} elsewhere than it is"
         else:
             for motor, (_, tau) in zip(self.motors, command, strict=True):
+                motor.expect_off()
                 motor.share = 1.0 if motor.status == Status.ENABLED and not self._sinks else 0.0
                 motor.hold()
                 motor.command = (motor.command[0], tau)
@@ -231,11 +239,12 @@ class ArmMachine:
         if not off:
             self._become(Phase.RAMPING, "", now_ns)
         elif now_ns - self._since_ns > _ENABLE_S * 1e9:
-            self.fail(f"{off[0].axis} does not switch on: {frames.status_text(off[0].status)}", now_ns)
+            self.fail(f"{off[0].axis} does not switch on: {off[0].said}", now_ns)
 
     def _ramp(self, now_ns: int) -> None:
+        seconds = self._settings.ramp_s * (_CAREFUL if any(motor.turn for motor in self.motors) else 1.0)
         for motor in self.motors:
-            motor.share = min(1.0, motor.share + self._settings.period_s / self._settings.ramp_s)
+            motor.share = min(1.0, motor.share + self._settings.period_s / seconds)
         if all(motor.share >= 1.0 for motor in self.motors):
             self._become(Phase.FOLLOWING, "", now_ns)
 

@@ -8,6 +8,7 @@ import select
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
@@ -19,8 +20,27 @@ from openarm_hardware.settings import Settings
 
 #: The process answers within this, s.
 _START_S = 20.0
+#: Time of a frame with 8 bytes on the wire, with the stuffing that is usual, s: classic at 1 Mbit/s; CAN FD, data at 5.
+_CLASSIC_S, _FLEXIBLE_S = 120e-6, 55e-6
+#: Most of the time of a bus that commands and replies may take.
+_LOAD = 0.9
 #: Longest reason of a stop, characters.
 _REASON = 300
+
+
+def check_load(axes: Sequence[Axis], settings: Settings) -> None:
+    """Refuse more motors than a bus carries.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, with the largest rate.
+    """
+    kind, frame_s = ("frames of CAN FD", _FLEXIBLE_S) if settings.flexible else ("classic frames", _CLASSIC_S)
+    for bus, n in Counter(axis.bus for axis in axes).items():
+        seconds = 2 * n * frame_s
+        if seconds > _LOAD * settings.period_s:
+            text = f"commands and replies of {n} motors in {kind} take {seconds * 1e3:.1f} ms on {bus}, of"
+            rate = f"{settings.period_s * 1e3:.1f} ms; set `motors.rate` to {int(_LOAD / seconds)} Hz or less"
+            raise OpenArmError(Code.CONFIG_INVALID, f"{text} {rate}, or give each arm a bus of its own")
 
 
 class ServoProcess:
@@ -35,10 +55,12 @@ class ServoProcess:
         scheduling: How its process is scheduled.
 
     Raises:
-        OpenArmError: BUSY or ENVIRONMENT, when it can't open a bus; TIMEOUT, when it does not answer.
+        OpenArmError: CONFIG_INVALID, for more motors than a bus carries at this rate; BUSY or ENVIRONMENT, when it
+            can't open a bus; TIMEOUT, when it does not answer.
     """
 
     def __init__(self, axes: Sequence[Axis], settings: Settings, last: Mapping[str, float] | None = None) -> None:
+        check_load(axes, settings)
         self.axes, self.settings = tuple(axes), settings
         fd = Exchange.make()
         try:

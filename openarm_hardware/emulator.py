@@ -90,7 +90,7 @@ def request(axes: Sequence[Axis], start: Mapping[str, float], **options: Any) ->
     Args:
         axes: The motors.
         start: Positions of joints that do not start at 0.
-        options: `weight`, `priority`, `seed`.
+        options: `weight`, `priority`, `seed`, `flexible`.
     """
     return json.dumps({"axes": [asdict(axis) for axis in axes], "start": dict(start), **options}) + "\n"
 
@@ -119,7 +119,8 @@ def main() -> int:
     axes = [Axis(**axis) for axis in asked["axes"]]
     motors = [EmulatedMotor(axis, asked["start"].get(axis.joint, 0.0) * axis.ratio + axis.offset) for axis in axes]
     buses = EmulatedBuses(motors, asked.get("seed", 0))
-    server = WatchedServer(buses, LooseJoints(motors, asked.get("weight", 1.0)).advance)
+    joints = LooseJoints(motors, asked.get("weight", 1.0))
+    server = WatchedServer(buses, joints.advance, flexible=asked.get("flexible", True))
     schedule(asked.get("priority", 0))
     os.write(1, b"{}\n")
     rest = b""

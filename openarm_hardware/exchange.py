@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 _HEAD = struct.Struct("=QI4x")
 #: Bytes of a sentence.
-_TEXT = 400
+_TEXT = 800
 #: Bins of the periods' histogram, 0.1 ms each.
 BINS, BIN_S = 600, 1e-4
 _TRIES = 50
@@ -35,6 +35,7 @@ class MotorState:
     mosfet: int
     rotor: int
     lost: int
+    turn: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ class Exchange:
     """
 
     def __init__(self, fd: int, joints: int, arms: int) -> None:
-        self._state = struct.Struct(f"=qqqq{arms}q{_TEXT}s" + "5d4q" * joints)
+        self._state = struct.Struct(f"=qqqq{arms}q{_TEXT}s" + "5d4qd" * joints)
         self._command = struct.Struct(f"=q{2 * joints}d")
         self._periods = struct.Struct(f"={BINS}Q")
         self._joints, self._arms = joints, arms
@@ -159,7 +160,7 @@ class Exchange:
         values = self._state.unpack(content)
         t_ns, cycles, late, errors, *rest = values
         phases, text, numbers = rest[: self._arms], rest[self._arms], rest[self._arms + 1 :]
-        motors = tuple(MotorState(*numbers[i : i + 9]) for i in range(0, 9 * self._joints, 9))
+        motors = tuple(MotorState(*numbers[i : i + 10]) for i in range(0, 10 * self._joints, 10))
         periods = self.period_block.read()
         return State(
             t_ns,

@@ -99,7 +99,7 @@ class Machine:
         found: list[MotorState | None] = [None] * len(self._axes)
         for name, arm in self.arms.items():
             for i, m in zip(self._at[name], arm.motors, strict=True):
-                found[i] = MotorState(m.q, m.dq, m.tau, *m.command, m.status, m.mosfet, m.rotor, m.lost)
+                found[i] = MotorState(m.q, m.dq, m.tau, *m.command, m.status, m.mosfet, m.rotor, m.lost, m.turn)
         return tuple(state for state in found if state is not None)
 
     def _fresh(self, now_ns: int, command: Command | None) -> Command | None:

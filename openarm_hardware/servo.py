@@ -149,7 +149,7 @@ class Servo:
 
     Args:
         machine: Decides what is sent.
-        links: Bus of each arm.
+        links: Bus of each arm, the same one of arms that share it.
         exchange: State and commands.
         settings: As the machine's.
         owner: Of the buses.
@@ -190,18 +190,23 @@ class Servo:
         if self._orphan_ns is not None and now_ns - self._orphan_ns > self._settings.orphan_s * 1e9:
             self._orphan_ns = None
             self._machine.release("the client has ended", now_ns)
-        received = [link.receive() for link in self._links]
-        for link, frames in zip(
-            self._links, self._machine.step(now_ns, received, self._exchange.read_command()), strict=True
-        ):
-            link.send(frames)
+        self._send(self._machine.step(now_ns, self._received(), self._exchange.read_command()))
         self._cycles += 1
         self._publish(now_ns)
+
+    def _received(self) -> list[list[Frame]]:
+        """Return what came from the bus of each arm; arms that share one take theirs of it."""
+        came = {link: link.receive() for link in set(self._links)}
+        return [came[link] for link in self._links]
+
+    def _send(self, frames: Sequence[Sequence[Frame]]) -> None:
+        for link, mine in zip(self._links, frames, strict=True):
+            link.send(mine)
 
     def _publish(self, now_ns: int) -> None:
         machine = self._machine
         phases = tuple(int(arm.phase) for arm in machine.arms.values())
-        errors = sum(link.errors for link in self._links)
+        errors = sum(link.errors for link in set(self._links))
         state = State(now_ns, self._cycles, self._late, phases, errors, machine.text, machine.motors())
         self._exchange.write_state(state)
         if self._cycles % _REPORT == 0:
@@ -230,9 +235,7 @@ class Servo:
         for line in lines:
             what, _, why = line.decode(errors="replace").partition(" ")
             if what == "h":
-                frames = self._machine.stop(now_ns, [link.receive() for link in self._links], why or STOPPED)
-                for link, mine in zip(self._links, frames, strict=True):
-                    link.send(mine)
+                self._send(self._machine.stop(now_ns, self._received(), why or STOPPED))
                 self._publish(now_ns)
             elif what == "r":
                 self._machine.reset(now_ns)
@@ -281,7 +284,8 @@ def main() -> int:
     machine = Machine(axes, settings, asked["last"])
     try:
         owner = Ownership(machine.buses)
-        links = [Link(address, flexible=settings.flexible) for address in machine.buses]
+        opened = {address: Link(address, flexible=settings.flexible) for address in set(machine.buses)}
+        links = [opened[address] for address in machine.buses]
     except OpenArmError as error:
         os.write(1, f"{error.code} {error.message}\n".encode())
         return 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an owner does to motors that are off: put their zeros where they are, and write down what is set in them."""
+"""What an owner does to motors that are off: set their ids, put their zeros where they are, write down what is set."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from openarm_common.motors import frames
 from openarm_common.motors.axis import Axis
 from openarm_common.motors.bus import Bus, open_bus
 from openarm_common.motors.frames import Feedback, Register, Status
-from openarm_hardware.scan import asked
+from openarm_hardware.scan import answering, asked
 from openarm_hardware.servo import Ownership
 
 #: After a zero was set, a motor reads less than this, rad of the motor.
 _AT_ZERO = 0.02
 #: Registers that say how a motor behaves.
 _GAINS = tuple(r for r in Register if r not in (Register.MST_ID, Register.ESC_ID, Register.TIMEOUT))
+#: A motor has stored its registers within this, s.
+_STORE_S = 0.1
 #: Registers are compared to this share: they are 32-bit floats.
 _SAME = 1e-5
 
@@ -33,15 +35,17 @@ class Zero:
 
     Attributes:
         joint: Its name.
-        before: Where the joint was said to be, rad; of a finger that slides m.
+        before: Where the joint was said to be.
         after: Where it is said to be now; None: it was not changed.
         turned: By so much the motor's zero moves, rad of the motor.
+        unit: Of the joint.
     """
 
     joint: str
     before: float
     after: float | None
     turned: float
+    unit: str
 
 
 def zeros(axes: Sequence[Axis], *, flexible: bool, write: bool) -> list[Zero]:
@@ -69,8 +73,49 @@ def zeros(axes: Sequence[Axis], *, flexible: bool, write: bool) -> list[Zero]:
             if after is not None and abs(after) > _AT_ZERO:
                 raise OpenArmError(Code.NOT_READY, f"{axis} did not take its zero: it is at {after:.3f} rad")
             joint = None if after is None else (after - axis.offset) / axis.ratio
-            found.append(Zero(axis.joint, (before - axis.offset) / axis.ratio, joint, before))
+            found.append(Zero(axis.joint, (before - axis.offset) / axis.ratio, joint, before, axis.unit))
     return found
+
+
+def set_id(address: str, motor: int, to: int, offset: int, *, flexible: bool) -> None:
+    """Give a motor an id, and its replies that id and an offset, and read back that it has them; it keeps them.
+
+    Args:
+        address: Of its bus.
+        motor: Its present id.
+        to: Its new one, or the same.
+        offset: Added for its replies.
+        flexible: Whether frames are sent as CAN FD.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for ids that no motor can have, or another one of the bus has; BUSY, when the
+            bus is commanded; NOT_READY, when the motor does not answer, is not off or did not take its ids.
+    """
+    for number in (motor, to):
+        if not 1 <= number <= frames.LAST_ID:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"a motor's id can't be {number}, expected 1 to {frames.LAST_ID}")
+    with _opened(address, flexible=flexible) as bus:
+        found = answering(bus)
+        if motor not in found:
+            known = ", ".join(map(str, found)) or "none"
+            text = f"motor {motor} does not answer on {address}; motors that do: {known}"
+            raise OpenArmError(Code.NOT_READY, f"{text}; `openarm hardware scan` says more")
+        others = {number: f"motor {i}" for i, reply in found.items() if i != motor for number in (i, reply)}
+        for number in (to, to + offset):
+            if number in others:
+                text = f"id {number} is that of {others[number]} or of its replies on {address}; choose another one"
+                raise OpenArmError(Code.INVALID_ARGUMENT, text)
+        replies, _ = asked(bus, {motor: found[motor]}, ())
+        kind = next(iter(frames.MOTOR_TYPES.values()))  # of its status alone
+        _off(f"motor {motor}", frames.decode_feedback(kind, replies.get(motor, b""), motor), motor)
+        bus.send([frames.write_register(motor, Register.MST_ID, to + offset)])
+        bus.send([frames.write_register(motor, Register.ESC_ID, to), frames.store_registers(to)])
+        time.sleep(_STORE_S)
+        bus.receive()
+        now = answering(bus)
+        if now.get(to) != to + offset or (to != motor and motor in now):
+            text = f"motor {motor} did not take id {to} with replies {to + offset}; motors with replies now: {now}"
+            raise OpenArmError(Code.NOT_READY, text)
 
 
 def gains(axes: Sequence[Axis], *, flexible: bool) -> dict[str, dict[str, float]]:
@@ -81,8 +126,7 @@ def gains(axes: Sequence[Axis], *, flexible: bool) -> dict[str, dict[str, float]
     """
     found = dict[str, dict[str, float]]()
     for bus, mine in _buses(axes, flexible=flexible):
-        offset = mine[0].reply_id - mine[0].id
-        _, registers = asked(bus, offset, [axis.id for axis in mine], _GAINS)
+        _, registers = asked(bus, {axis.id: axis.reply_id for axis in mine}, _GAINS)
         for axis in mine:
             values = registers.get(axis.id, {})
             if not values:
@@ -140,11 +184,16 @@ def _state(bus: Bus, axis: Axis) -> Feedback:
     Raises:
         OpenArmError: NOT_READY, when it is not, or does not answer.
     """
-    replies, _ = asked(bus, axis.reply_id - axis.id, [axis.id], ())
-    state = frames.decode_feedback(frames.motor_type(axis.type), replies.get(axis.id, b""))
+    replies, _ = asked(bus, {axis.id: axis.reply_id}, ())
+    return _off(
+        str(axis), frames.decode_feedback(frames.motor_type(axis.type), replies.get(axis.id, b""), axis.id), axis.id
+    )
+
+
+def _off(who: str, state: Feedback | None, motor: int) -> Feedback:
     if state is None:
-        raise OpenArmError(Code.NOT_READY, f"{axis} does not answer; is the arm's power on?")
+        raise OpenArmError(Code.NOT_READY, f"{who} does not answer; is the arm's power on?")
     if state.status != Status.DISABLED:
-        text = f"{axis} is not off but {frames.status_text(state.status)}; end what commands it, or clear the error"
-        raise OpenArmError(Code.NOT_READY, text)
+        said = frames.status_text(state.status, motor)
+        raise OpenArmError(Code.NOT_READY, f"{who} is not off but {said}; end what commands it, or clear the error")
     return state

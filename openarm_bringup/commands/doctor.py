@@ -122,6 +122,7 @@ def _hardware() -> list[Finding]:
         else:
             name = address.partition(":")[2]
             findings += hardware.check_can(address, sys_, _link(name), flexible=wiring.flexible)
+        findings.append(hardware.check_motors(address, wiring))
     limits = [resource.getrlimit(kind)[1] for kind in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK)]
     findings.append(hardware.check_priority(limits[0], limits[1], root=os.geteuid() == 0))
     videos = [path for path in dev.glob("video*") if os.access(path, os.R_OK | os.W_OK)]

@@ -33,23 +33,45 @@ def scan(bus: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ())
         bus: `socketcan:can0`, or as hardware.yaml says; those of the robot's folder when left out.
     """
     from openarm_common.motors.wiring import load_wiring
-    from openarm_hardware.scan import scanned
+    from openarm_hardware.scan import scanned, silence, unset
 
     wiring = load_wiring()
     buses = bus or tuple(dict.fromkeys(arm.bus for arm in wiring.arms.values()))
     found = scanned(buses, wiring)
-    lines = [f"{'bus':<20}{'id':>4}  {'status':<22}{'rad':>8}{'°C':>5}  mode       timeout  firmware  ranges"]
+    lines = [
+        f"{'bus':<20}{'id':>4}{'reply':>7}  {'status':<22}{'rad':>8}{'°C':>5}  mode       timeout s  firmware  ranges"
+    ]
     for m in found:
         celsius = f"{m.celsius}" if m.celsius is not None else ""
         q = f"{m.q:.3f}" if m.q is not None else ""
         ranges = "/".join(f"{x:g}" for x in m.ranges)
-        state = f"{m.bus:<20}{m.id:>4}  {m.status:<22}{q:>8}{celsius:>5}"
-        lines.append(f"{state}  {m.mode:<9}  {m.timeout_s:<7g}  {m.firmware:<8}  {ranges}")
+        state = f"{m.bus:<20}{m.id:>4}{m.reply_id:>#7x}  {m.status:<22}{q:>8}{celsius:>5}"
+        lines.append(f"{state}  {m.mode:<9}  {m.timeout_s:<9g}  {m.firmware:<8}  {ranges}")
     data = {"motors": [vars(motor) for motor in found]}
-    if not found:
-        text = f"no motor answers on {', '.join(buses)}; is the arm's power on, its bus up and at the right bitrate?"
-        return Outcome(False, text, Code.NOT_READY, data)
-    return Outcome(True, f"{len(found)} motors answer", data=data, text="\n".join(lines))
+    heard = {motor.bus for motor in found}
+    wrong = [*(silence(address, wiring) for address in buses if address not in heard), *unset(found, wiring)]
+    text = "\n".join(lines if found else ())
+    if wrong:
+        return Outcome(False, "; ".join(wrong), Code.NOT_READY, data, text)
+    return Outcome(True, f"{len(found)} motors answer", data=data, text=text)
+
+
+@hardware.command
+def set_id(bus: str, motor: int, *, to: int = 0) -> Outcome:
+    """Set the ids of a motor, and read them back; it keeps them without power. Connect new motors one by one.
+
+    Args:
+        bus: As of `scan`.
+        motor: Its present id.
+        to: Its new one; 0: it keeps it, and only its replies get the id that hardware.yaml expects.
+    """
+    from openarm_common.motors.wiring import load_wiring
+    from openarm_hardware import upkeep
+
+    wiring = load_wiring()
+    new, offset = to or motor, wiring.joints.reply_offset
+    upkeep.set_id(bus, motor, new, offset, flexible=wiring.flexible)
+    return Outcome(True, f"motor {motor} of {bus} has id {new:#x} now, and answers with {new + offset:#x}")
 
 
 @hardware.command
@@ -76,7 +98,10 @@ def zero(*joints: str, yes: Annotated[bool, Parameter(negative=())] = False, emu
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}; there are: {', '.join(sorted(known))}")
     would = zeros(chosen, flexible=flexible, write=False)
     at = {axis.joint: 0.0 - axis.offset / axis.ratio for axis in chosen}
-    lines = [f"{z.joint:<28} is at {z.before:8.4f}, will be {at[z.joint]:8.4f} where it is now" for z in would]
+    lines = [
+        f"{z.joint:<28} is at {z.before:8.4f} {z.unit}, will be {at[z.joint]:8.4f} {z.unit} where it is now"
+        for z in would
+    ]
     shown = console()
     shown.print("\n".join(lines), markup=False, highlight=False)
     if not yes:
@@ -84,7 +109,7 @@ def zero(*joints: str, yes: Annotated[bool, Parameter(negative=())] = False, emu
         if not sys.stdin.isatty() or input("type zero to do it: ").strip() != "zero":
             return Outcome(False, "nothing was changed; `--yes` does it without asking", Code.CANCELLED)
     done = zeros(chosen, flexible=flexible, write=True)
-    text = "\n".join(f"{z.joint:<28} was at {z.before:8.4f}, is at {z.after:8.4f}" for z in done)
+    text = "\n".join(f"{z.joint:<28} was at {z.before:8.4f} {z.unit}, is at {z.after:8.4f} {z.unit}" for z in done)
     forgotten = _forget_posture(emulated=emulated)
     return Outcome(
         True, f"zeros of {len(done)} motors were set{forgotten}", data={"zeros": list(map(vars, done))}, text=text

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from openarm_bringup.doctor.checks import Finding, error, note, ok
+from openarm_common.errors import OpenArmError
+from openarm_common.motors.wiring import Wiring
 
 #: Bits a second of arbitration and of data, as the maker sets them.
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
@@ -64,6 +66,35 @@ def check_can(address: str, sys: Path, link: Mapping[str, Any] | None, *, flexib
     else:
         findings.append(ok(what, f"{adapter}, up, {rate} bit/s, {data_rate or 'none'} for data, {state}, {errors}"))
     return findings
+
+
+def check_motors(address: str, wiring: Wiring) -> Finding:
+    """Check that motors answer on a bus, with both kinds of frames when they do not with the one; only asks.
+
+    Args:
+        address: Of the bus.
+        wiring: Of the robot.
+    """
+    from openarm_hardware.scan import scanned, silence, unset
+    from openarm_hardware.servo import Ownership
+
+    what = f"motors on {address}"
+    try:
+        owner = Ownership([address], takeover_s=0.0)
+    except OpenArmError as busy:
+        return note(what, busy.message, "they are asked when no process commands them")
+    try:
+        found = scanned([address], wiring)
+        if not found:
+            observed, _, advice = silence(address, wiring).partition("; ")
+            return error(what, observed, advice)
+    except OpenArmError as failure:
+        return error(what, failure.message, "look at what is said of the bus above")
+    finally:
+        owner.close()
+    if wrong := unset(found, wiring):
+        return error(what, f"{len(found)} answer", "; ".join(wrong))
+    return ok(what, f"{len(found)} answer")
 
 
 def check_python_can(address: str, *, installed: bool) -> Finding:

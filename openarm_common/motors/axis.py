@@ -25,6 +25,7 @@ class Axis:
         damping: kd with which it stops softly.
         torque: Largest of the motor, N m.
         grips: Commanded by POS_FORCE instead of MIT.
+        unit: Of the joint's position, rad or m.
     """
 
     joint: str
@@ -43,6 +44,7 @@ class Axis:
     damping: float
     torque: float
     grips: bool
+    unit: str = "rad"
 
     def __str__(self) -> str:
         return f"{self.joint} (motor {self.id:#04x} of {self.bus})"

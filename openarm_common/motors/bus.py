@@ -140,7 +140,7 @@ class SocketBus(Bus):
     Args:
         connection: Connected or bound.
         address: Names it.
-        flexible: Whether frames are sent as CAN FD; both kinds are received.
+        flexible: Whether frames are sent as CAN FD, and both kinds received; else classic ones alone, as by the kernel.
     """
 
     def __init__(self, connection: socket.socket, address: str, *, flexible: bool = True) -> None:
@@ -167,7 +167,7 @@ class SocketBus(Bus):
                 raise ConnectionResetError(errno.ECONNRESET, f"{self.address} was closed")
             for k in range(n):
                 raw = batch.slots[k][: batch.entries[k].length]
-                frame = unpack(raw)
+                frame = unpack(raw) if self._flexible or len(raw) == _CLASSIC.size else None
                 if frame is not None:
                     found.append(frame)
                 elif is_error(raw):

@@ -3,11 +3,13 @@
 
 What a motor does with a frame is that of the documents named in `frames`; what they leave open is assumed so: reading,
 writing and refreshing are answered by a motor that is off, too, a command for another control mode is answered and not
-followed, an error switches a motor off until it is cleared, and TIMEOUT runs while it is on.
+followed, an error switches a motor off until it is cleared, TIMEOUT runs while it is on, and a motor that gets power
+reads a position within half a turn of its zero: turns that it made are lost.
 """
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterable, Sequence
 
@@ -45,10 +47,12 @@ FAULTS = {
     "hot": "the motor of `joint` reports `value` °C",
     "freeze": "the encoder of `joint` stays where it is",
     "zero": "the zero of `joint` jumps by `value` rad of the motor",
+    "turn": "the motor of `joint` reads `value` turns more",
+    "factory": "the motor of `joint` answers with id 0, as it comes from the factory",
     "loss": "a share `value` of the replies is lost",
     "late": "replies come `value` s later",
     "bus_off": "no frame passes on the bus of `joint`",
-    "power": "all motors are without power",
+    "power": "all motors are without power, by which they lose turns and what was not stored",
 }
 
 
@@ -84,15 +88,36 @@ class EmulatedMotor:
             Register.TMAX: self.kind.tau_max,
             **_OF_FACTORY,
         }
+        self._stored = dict(self.registers)
         self.command: MitCommand | PosForceCommand | None = None
         self.commands = 0
         self._heard_ns = 0
+
+    @property
+    def id(self) -> int:
+        """Of frames to it."""
+        return int(self.registers[Register.ESC_ID])
+
+    @property
+    def reply_id(self) -> int:
+        """Of frames from it."""
+        return int(self.registers[Register.MST_ID])
+
+    def forget_reply_id(self) -> None:
+        """Answer with id 0 for good, as a motor that was never set up."""
+        self.registers[Register.MST_ID] = self._stored[Register.MST_ID] = 0
+
+    def restart(self) -> None:
+        """Begin again, as without power."""
+        self.on, self.command = False, None
+        self.registers = dict(self._stored)
+        self.zero -= math.tau * round((self.q + self.zero) / math.tau)
 
     def take(self, number: int, data: bytes, now_ns: int) -> bytes | None:
         """Take a frame of the bus; return the reply, None for a frame to another one."""
         if number == frames.REGISTER_ID:
             return self._register(data)
-        base = number - self.axis.id
+        base = number - self.id
         modes = {0: 1, frames.POS_VEL_BASE: 2, frames.VEL_BASE: 3, frames.POS_FORCE_BASE: 4}
         if base not in modes or len(data) != 8:
             return None
@@ -112,9 +137,7 @@ class EmulatedMotor:
         status = self.error or (Status.ENABLED if self.on else Status.DISABLED)
         q = (self.q if self.frozen is None else self.frozen) + self.zero
         dq = self.dq if self.frozen is None else 0.0
-        return frames.encode_feedback(
-            self.kind, Feedback(status, self.axis.id, q, dq, self.tau, self.celsius, self.celsius)
-        )
+        return frames.encode_feedback(self.kind, Feedback(status, self.id, q, dq, self.tau, self.celsius, self.celsius))
 
     def expire(self, now_ns: int) -> None:
         """Switch off when no command came for as long as TIMEOUT says."""
@@ -156,16 +179,19 @@ class EmulatedMotor:
 
     def _register(self, data: bytes) -> bytes | None:
         request = frames.decode_register_request(data)
-        if request is None or request[0] != self.axis.id:
+        if request is None or request[0] != self.id:
             return None
-        _, what, register, value = request
+        motor, what, register, value = request
         if what == "refresh":
             return self.feedback()
+        if what == "store" and not self.on:
+            self._stored = dict(self.registers)
+            return data
         if register not in self.registers:
             return None
         if what == "write":
             self.registers[register] = value
-        return frames.register_reply(self.axis.id, register, self.registers[register], written=what == "write")
+        return frames.register_reply(motor, register, self.registers[register], written=what == "write")
 
 
 class EmulatedBuses:
@@ -193,7 +219,7 @@ class EmulatedBuses:
             for motor in mine:
                 reply = motor.take(number, data, now_ns)
                 if reply is not None and not motor.silent and not (self.loss and self._rng.random() < self.loss):
-                    out.append((motor.axis.reply_id, reply))
+                    out.append((motor.reply_id, reply))
         return out
 
     def inject(self, fault: str, joint: str = "", value: float = 0.0) -> None:
@@ -217,8 +243,7 @@ class EmulatedBuses:
         elif fault == "power":
             self.power = False
             for motor in self.motors:
-                motor.on, motor.command = False, None
-                motor.registers[Register.TIMEOUT] = 0
+                motor.restart()
         else:
             self._of(fault, self._motor(joint), value)
 
@@ -233,6 +258,10 @@ class EmulatedBuses:
             motor.frozen = motor.q
         elif fault == "zero":
             motor.zero += value
+        elif fault == "turn":
+            motor.zero += math.tau * value
+        elif fault == "factory":
+            motor.forget_reply_id()
         else:
             self._off.add(motor.axis.bus)
 

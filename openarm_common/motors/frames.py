@@ -28,14 +28,14 @@ KP_MAX, KD_MAX = 500.0, 5.0
 POS_VEL_BASE, VEL_BASE, POS_FORCE_BASE = 0x100, 0x200, 0x300
 #: Id of frames that read or write registers, or ask for a reply.
 REGISTER_ID = 0x7FF
-#: Motors of one bus have ids 1 to this one, as a reply has 4 bits for it.
-LAST_ID = 15
+#: Motors have ids 1 to this one; from 0x100 on ids of frames are those of commands of other control modes.
+LAST_ID = 0xFF
 #: Steps of POS_FORCE commands: speed by 1/100 rad/s, current by 1/10,000 of the motor's largest.
 _SPEED_STEPS, _CURRENT_STEPS = 100.0, 10_000.0
 
 _ENABLE, _DISABLE, _SET_ZERO, _CLEAR = (bytes([0xFF] * 7 + [last]) for last in (0xFC, 0xFD, 0xFE, 0xFB))
 _WORD = struct.Struct(">Q")
-_READ, _WRITE, _REFRESH = 0x33, 0x55, 0xCC
+_READ, _WRITE, _STORE, _REFRESH = 0x33, 0x55, 0xAA, 0xCC
 
 
 class Status(IntEnum):
@@ -147,7 +147,7 @@ class PosForceCommand(NamedTuple):
 
 
 class Feedback(NamedTuple):
-    """A reply: status nibble, id of the motor, its state, temperatures of MOSFET and rotor, °C."""
+    """A reply: status nibble, id of the motor (its low nibble), its state, temperatures of MOSFET and rotor, °C."""
 
     status: int
     id: int
@@ -179,10 +179,22 @@ def motor_type(name: str) -> MotorType:
     return MOTOR_TYPES[name]
 
 
-def status_text(status: int) -> str:
-    """Return what a status nibble says, in words."""
-    known = {int(item): item.name.replace("_", " ").lower() for item in Status}
-    return known.get(status, f"unknown status {status:#x}")
+def status_text(status: int, motor: int = 0) -> str:
+    """Return what a status nibble of a motor says, in words; all errors that it may stand for when the id hides some.
+
+    Args:
+        status: Nibble of `decode_feedback`.
+        motor: Id.
+    """
+    hidden = motor >> 4 if status >= Status.OVER_VOLTAGE else 0
+    known = [item.name.replace("_", " ").lower() for item in Status if item & ~hidden == status & ~hidden]
+    return " or ".join(known) or f"unknown status {status:#x}"
+
+
+def version_text(version: int) -> str:
+    """Return a firmware version: the text of its four bytes, lowest first, where they are one, else the number."""
+    text = (version & 0xFFFFFFFF).to_bytes(4, "little")
+    return text.decode() if all(0x20 < letter < 0x7F for letter in text) else str(version)
 
 
 def encode_mit(kind: MotorType, command: MitCommand) -> bytes:
@@ -222,8 +234,7 @@ def encode_feedback(kind: MotorType, reply: Feedback) -> bytes:
         OpenArmError: INVALID_ARGUMENT, for what is no number.
     """
     return _WORD.pack(
-        (reply.status & 15) << 60
-        | (reply.id & 15) << 56
+        ((reply.status & 15) << 4 | reply.id & 0xFF) << 56
         | _steps(reply.q, -kind.q_max, kind.q_max, 65535) << 40
         | _steps(reply.dq, -kind.dq_max, kind.dq_max, 4095) << 28
         | _steps(reply.tau, -kind.tau_max, kind.tau_max, 4095) << 16
@@ -232,13 +243,22 @@ def encode_feedback(kind: MotorType, reply: Feedback) -> bytes:
     )
 
 
-def decode_feedback(kind: MotorType, data: bytes) -> Feedback | None:
-    """Return a reply; None for another length."""
+def decode_feedback(kind: MotorType, data: bytes, motor: int = 0) -> Feedback | None:
+    """Return a reply; None for another length.
+
+    The first byte is ID | STATUS << 4 with the low 8 bits of the id, which is not cut to its nibble: 0x10 of motor 16
+    says that it is off. Ids above 15 therefore hide bits of the status that they have themselves (`hides_enabled`).
+
+    Args:
+        kind: Type of the motor.
+        data: Of the frame.
+        motor: Id of the motor, by the id of the frame; only ids above 15 matter.
+    """
     if len(data) != 8:
         return None
     word = _WORD.unpack(data)[0]
     return Feedback(
-        word >> 60,
+        (data[0] - (motor & 0xF0) & 0xFF) >> 4,
         word >> 56 & 15,
         _value(word >> 40 & 65535, -kind.q_max, kind.q_max, 65535),
         _value(word >> 28 & 4095, -kind.dq_max, kind.dq_max, 4095),
@@ -246,6 +266,11 @@ def decode_feedback(kind: MotorType, data: bytes) -> Feedback | None:
         word >> 8 & 255,
         word & 255,
     )
+
+
+def hides_enabled(motor: int) -> bool:
+    """Return whether replies of a motor with this id look the same when it is on and when it is off."""
+    return bool(motor & Status.ENABLED << 4)
 
 
 def enable(motor: int) -> tuple[int, bytes]:
@@ -293,6 +318,11 @@ def write_register(motor: int, register: int, value: float) -> tuple[int, bytes]
     return REGISTER_ID, bytes([motor & 255, motor >> 8, _WRITE, register]) + packed
 
 
+def store_registers(motor: int) -> tuple[int, bytes]:
+    """Return the frame that makes a motor that is off keep its registers without power."""
+    return REGISTER_ID, bytes([motor & 255, motor >> 8, _STORE, 1, 0, 0, 0, 0])
+
+
 def register_reply(motor: int, register: int, value: float, *, written: bool) -> bytes:
     """Return what a motor answers to a read or a write."""
     data = write_register(motor, register, value)[1]
@@ -311,12 +341,14 @@ def decode_register(data: bytes) -> RegisterReply | None:
 
 
 def decode_register_request(data: bytes) -> tuple[int, str, int, float] | None:
-    """Return what a frame to `REGISTER_ID` asks: motor, "read", "write" or "refresh", register and value."""
+    """Return what a frame to `REGISTER_ID` asks: motor, "read", "write", "store" or "refresh", register and value."""
     if len(data) < 4:
         return None
     motor, what, register = data[0] | data[1] << 8, data[2], data[3]
     if what == _REFRESH:
         return motor, "refresh", 0, 0.0
+    if what == _STORE:
+        return motor, "store", 0, 0.0
     if what == _READ:
         return motor, "read", register, 0.0
     if what != _WRITE or len(data) != 8:

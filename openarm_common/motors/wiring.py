@@ -6,7 +6,7 @@ Values by joint are those of one arm, from the shoulder; all arms have the same 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -30,7 +30,7 @@ class JointMotors(Config):
         types: Of the motors.
         stiffness, damping: Gains kp and kd of their commands, N m/rad and N m s/rad.
         stop_damping: kd with which an arm stops softly when it can't be held.
-        ids: Of frames to them; of frames from them `reply_offset` is added.
+        ids: Of frames to them, unless an arm has its own; of frames from them `reply_offset` is added.
         reply_offset: Added to the ids.
         directions: 1, or -1 where motor and joint turn against each other.
     """
@@ -83,10 +83,13 @@ class ArmWiring(Config):
     Attributes:
         bus: Address; `openarm_common.motors.bus.open_bus`.
         offsets: Motor positions where the joints are at 0, rad; empty: 0.
+        ids: Of frames to its motors, the gripper's last, where another arm is on the same bus; empty: those of
+            `joints` and `gripper`.
     """
 
     bus: str = Field(min_length=1)
     offsets: tuple[float, ...] = ()
+    ids: tuple[Id, ...] = ()
 
 
 class Wiring(Config):
@@ -125,22 +128,26 @@ def axes_of(wiring: Wiring, description: RobotDescription, buses: Mapping[str, s
     Args:
         wiring: Of the robot.
         description: The robot.
-        buses: Addresses by arm, in place of those of the wiring.
+        buses: Addresses by arm, in place of those of the wiring; arms of one bus have that of the first of them.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, when wiring and description do not fit.
+        OpenArmError: CONFIG_INVALID, when wiring and description do not fit, or two motors of a bus have the same id.
     """
     if missing := [name for name in description.arm_names if name not in wiring.arms]:
         text = f"hardware.yaml has no arm {', '.join(missing)}; it has {', '.join(wiring.arms)}"
         raise OpenArmError(Code.CONFIG_INVALID, text)
-    found = list[Axis]()
+    found, first = list[Axis](), dict[str, str]()
     for arm, parts in description.arms.items():
         place, joints = wiring.arms[arm], wiring.joints
         if len(joints.ids) != len(parts.joints) or len(place.offsets) not in (0, len(parts.joints)):
             n = len(parts.joints)
             text = f"hardware.yaml has {len(joints.ids)} motors, arm {arm} has {n} joints; expected as many"
             raise OpenArmError(Code.CONFIG_INVALID, text)
-        bus = (buses or {}).get(arm, place.bus)
+        ids = place.ids or (*joints.ids, wiring.gripper.id)
+        if len(ids) != len(parts.joints) + 1:
+            text = f"hardware.yaml: arms.{arm}.ids has {len(ids)} values, expected {len(parts.joints) + 1}:"
+            raise OpenArmError(Code.CONFIG_INVALID, f"{text} one for each joint, and the gripper's")
+        bus = (buses or {}).get(first.setdefault(place.bus, arm), place.bus)
         lower, upper = description.limits(parts.controlled)
         speed = [description.joint(name).velocity for name in parts.controlled]
         for i, joint in enumerate(parts.joints):
@@ -149,8 +156,8 @@ def axes_of(wiring: Wiring, description: RobotDescription, buses: Mapping[str, s
                     joint,
                     arm,
                     bus,
-                    joints.ids[i],
-                    joints.ids[i] + joints.reply_offset,
+                    ids[i],
+                    ids[i] + joints.reply_offset,
                     joints.types[i],
                     float(joints.directions[i]) if joints.directions else 1.0,
                     place.offsets[i] if place.offsets else 0.0,
@@ -171,8 +178,8 @@ def axes_of(wiring: Wiring, description: RobotDescription, buses: Mapping[str, s
                 parts.finger_joint,
                 arm,
                 bus,
-                hand.id,
-                hand.id + joints.reply_offset,
+                ids[-1],
+                ids[-1] + joints.reply_offset,
                 hand.type,
                 ratio,
                 0.0,
@@ -184,6 +191,28 @@ def axes_of(wiring: Wiring, description: RobotDescription, buses: Mapping[str, s
                 0.0,
                 hand.torque,
                 grips=True,
+                unit="m" if description.joint(parts.finger_joint).type == "prismatic" else "rad",
             )
         )
+    _check_ids(found)
     return tuple(found)
+
+
+def _check_ids(axes: Sequence[Axis]) -> None:
+    """Refuse frames of one bus that are of two motors, or to one and from another.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming both, and what to set.
+    """
+    taken = dict[tuple[str, int], str]()
+    for axis in axes:
+        for number, way in ((axis.id, "to"), (axis.reply_id, "from")):
+            who = f"{way} {axis.joint} (motor {axis.id})"
+            if (other := taken.setdefault((axis.bus, number), who)) != who:
+                raise OpenArmError(
+                    Code.CONFIG_INVALID,
+                    f"frames {other} and {who} have the same id {number:#x} on {axis.bus}; in hardware.yaml give arm"
+                    f" {axis.arm} a bus of its own, or other ids, as"
+                    f" `arms.{axis.arm}.ids: [9, 10, 11, 12, 13, 14, 15, 16]` (`openarm hardware set-id` sets them in"
+                    " the motors)",
+                )

@@ -27,7 +27,8 @@ from openarm_control.ros.controllers import Controllers
 from openarm_control.ros.process import ControlNode, timely
 from openarm_control.ros.robot_publisher import RobotPublisher
 from openarm_control.servos import KnownServos
-from openarm_hardware.arm import Phase
+from openarm_hardware.arm import UNPLACED, Phase
+from openarm_hardware.axis import turn_text
 from openarm_hardware.client import ServoProcess
 from openarm_hardware.config import HardwareNodeConfig
 from openarm_hardware.driver import MotorDriver
@@ -57,9 +58,11 @@ class OpenArmHardware(ControlNode[HardwareNodeConfig]):
         sockets = emulated_buses(self.context.get_domain_id(), description.arm_names, config.motor_sockets)
         self._axes = axes_of(wiring, description, sockets if config.emulated else None)
         if config.emulated:
-            _await_buses(sockets.values(), flexible=wiring.flexible)
+            _await_buses({axis.bus for axis in self._axes}, flexible=wiring.flexible)
         self._settings = config.motors.settings(flexible=wiring.flexible)
         self._posture = LastPosture(config.calibrations, "_emulated" if config.emulated else "")
+        self._known = self._posture.read()
+        self._turns = dict[str, float]()
         seed = None if config.dynamics_seed < 0 else config.dynamics_seed
         known = {side: _servo_model(config, wiring, description, load) for side, load in loads.items()}
         servos = KnownServos(known, config.calibrations, seed, self.get_logger().warning)
@@ -78,7 +81,7 @@ class OpenArmHardware(ControlNode[HardwareNodeConfig]):
         self._states = RobotPublisher(self, description, names)
         self._tf_ticks = RateDivider(config.tf_rate)
         guard = TouchGuard(SelfCollision(description, names))
-        servo = self._start_servo(self._posture.read())
+        servo = self._start_servo(self._known)
         self._driver = MotorDriver(servo, self._controller, loads, guard, self._publish)
         self._loop = MotorRobot(self._controller, self._driver, config.stale_after, self._observe, self.on_crash)
         self._controllers = Controllers(self, self._loop, self._controller, servos, config.gripper_action)
@@ -117,11 +120,19 @@ class OpenArmHardware(ControlNode[HardwareNodeConfig]):
             self._controllers.publish_states()
 
     def _store(self) -> None:
+        """Store where the joints are, of arms of which it is known; the others keep what is stored."""
         state = self._driver.state
-        if state is not None:
-            positions = {a.joint: m.q for a, m in zip(self._axes, state.motors, strict=True)}
-            if why := self._posture.write(positions):
-                self.get_logger().warning(why, throttle_duration_sec=60.0)
+        if state is None:
+            return
+        phases = dict(zip(dict.fromkeys(axis.arm for axis in self._axes), state.phases, strict=True))
+        rows = [row for row in zip(self._axes, state.motors, strict=True) if phases[row[0].arm] not in UNPLACED]
+        self._known |= {axis.joint: motor.q for axis, motor in rows}
+        if rows and (why := self._posture.write(self._known)):
+            self.get_logger().warning(why, throttle_duration_sec=60.0)
+        for axis, motor in rows:
+            if motor.turn != self._turns.setdefault(axis.joint, 0.0):
+                self._turns[axis.joint] = motor.turn
+                self.get_logger().warning(turn_text(axis, motor.q, motor.turn) or f"{axis} lost no turn any more")
 
     def _report(self) -> None:
         """Report once per second; start the process of the motors again when it has ended."""
@@ -169,7 +180,8 @@ class OpenArmHardware(ControlNode[HardwareNodeConfig]):
         found: dict[str, object] = {f"{arm}_phase": Phase(p).name for arm, p in zip(arms, state.phases, strict=True)}
         for axis, motor in zip(self._axes, state.motors, strict=True):
             hottest = max(motor.mosfet, motor.rotor)
-            found[axis.joint] = f"status {motor.status:#x}, {hottest} °C, {motor.lost} replies lost"
+            turn = f"; {turn_text(axis, motor.q, motor.turn)}" if motor.turn else ""
+            found[axis.joint] = f"status {motor.status:#x}, {hottest} °C, {motor.lost} replies lost{turn}"
         return found | {
             "period_p50_ms": f"{p50 * 1e3:.2f}",
             "period_p99_ms": f"{p99 * 1e3:.2f}",

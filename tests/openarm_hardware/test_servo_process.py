@@ -215,5 +215,5 @@ def test_a_scan_lists_the_motors_that_answer_and_switches_none_on(rig: Rig) -> N
         (12.5, 45.0, 54.0),
     )
     assert first.q == pytest.approx(0.3, abs=0.001)
-    assert (finger.id, finger.celsius, finger.firmware) == (8, 35, 5015)
+    assert (finger.id, finger.celsius, finger.firmware) == (8, 35, "5015")
     assert not any(rig.ask()[axis.joint]["on"] for axis in rig.axes)
