@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.motors import frames
 from openarm_common.motors.bus import Bus, Frame, open_bus
-from openarm_common.motors.frames import LAST_ID, ControlMode, Register
+from openarm_common.motors.frames import HIGHEST_ID, ControlMode, Register
 from openarm_common.motors.wiring import Wiring
 
 #: Registers that are read, and for how long answers to one question are waited for, s.
@@ -115,8 +115,8 @@ def answering(bus: Bus) -> dict[int, int]:
                     found[answer.id] = number
             time.sleep(0.001)
 
-    for first in range(1, LAST_ID + 1, _AT_ONCE):
-        ids = range(first, min(first + _AT_ONCE, LAST_ID + 1))
+    for first in range(1, HIGHEST_ID + 1, _AT_ONCE):
+        ids = range(first, min(first + _AT_ONCE, HIGHEST_ID + 1))
         bus.send([frames.read_register(motor, Register.MST_ID) for motor in ids])
         listen(_STEP_S)
     listen(_WAIT_S)

@@ -91,9 +91,8 @@ def set_id(address: str, motor: int, to: int, offset: int, *, flexible: bool) ->
         OpenArmError: INVALID_ARGUMENT, for ids that no motor can have, or another one of the bus has; BUSY, when the
             bus is commanded; NOT_READY, when the motor does not answer, is not off or did not take its ids.
     """
-    for number in (motor, to):
-        if not 1 <= number <= frames.LAST_ID:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"a motor's id can't be {number}, expected 1 to {frames.LAST_ID}")
+    if not 1 <= to <= frames.LAST_ID:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"a motor's id can't be {to}, expected 1 to {frames.LAST_ID}")
     with _opened(address, flexible=flexible) as bus:
         found = answering(bus)
         if motor not in found:

@@ -28,8 +28,10 @@ KP_MAX, KD_MAX = 500.0, 5.0
 POS_VEL_BASE, VEL_BASE, POS_FORCE_BASE = 0x100, 0x200, 0x300
 #: Id of frames that read or write registers, or ask for a reply.
 REGISTER_ID = 0x7FF
-#: Motors have ids 1 to this one; from 0x100 on ids of frames are those of commands of other control modes.
-LAST_ID = 0xFF
+#: Largest id that a motor can have; from 0x100 on ids of frames are those of commands of other control modes.
+HIGHEST_ID = 0xFF
+#: Largest id of a motor that is commanded: in replies of higher ones, errors can look like a motor that is only off.
+LAST_ID = 0x1F
 #: Steps of POS_FORCE commands: speed by 1/100 rad/s, current by 1/10,000 of the motor's largest.
 _SPEED_STEPS, _CURRENT_STEPS = 100.0, 10_000.0
 
@@ -334,7 +336,7 @@ def decode_register(data: bytes) -> RegisterReply | None:
 
     A reply of a motor that is disabled, within 0.1 rad of -12.5 rad, could look the same; no joint goes there.
     """
-    if len(data) != 8 or data[2] not in (_READ, _WRITE) or data[1] != 0 or not 1 <= data[0] <= LAST_ID:
+    if len(data) != 8 or data[2] not in (_READ, _WRITE) or data[1] != 0 or not 1 <= data[0] <= HIGHEST_ID:
         return None
     value = struct.unpack("<I" if data[3] in WHOLE else "<f", data[4:])[0]
     return RegisterReply(data[0], data[3], value, data[2] == _WRITE)

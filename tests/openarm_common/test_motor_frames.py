@@ -117,6 +117,49 @@ def test_known_frames() -> None:
     ]
 
 
+def test_frames_of_two_arms_on_one_bus() -> None:
+    """Motor 16, by id 0x20: its id is not cut to a nibble. Motor 12, with a byte as of a written register."""
+    kind = frames.motor_type("DM4310")
+    off = bytes.fromhex("107fff7ff7fd1d1b")
+    state = frames.decode_feedback(kind, off, 16)
+    assert state is not None
+    assert (state.status, state.id, state.mosfet, state.rotor) == (frames.Status.DISABLED, 0, 29, 27)
+    assert state.q == pytest.approx(0.0, abs=1e-3)
+    assert frames.decode_register(off) is None
+    twelfth = bytes.fromhex("0c5f557ff8001f1c")
+    state = frames.decode_feedback(kind, twelfth, 12)
+    assert frames.decode_register(twelfth) is None
+    assert state is not None
+    assert (state.status, state.id, state.mosfet, state.rotor) == (0, 12, 31, 28)
+    assert state.q == pytest.approx(0x5F55 * 25.0 / 65535 - 12.5)
+
+
+@given(st.integers(1, frames.LAST_ID), st.sampled_from(frames.Status))
+def test_the_status_of_any_motor_is_read_or_one_that_looks_the_same(motor: int, status: frames.Status) -> None:
+    kind = frames.motor_type("DM4310")
+    data = frames.encode_feedback(kind, Feedback(status, motor, 0.0, 0.0, 0.0, 30, 30))
+    state = frames.decode_feedback(kind, data, motor)
+    assert state is not None
+    assert state.id == motor & 15
+    assert data[0] == motor & 0xFF | status << 4
+    assert state.status | motor >> 4 == status | motor >> 4
+    if status > 1:
+        assert status.name.replace("_", " ").lower() in frames.status_text(state.status, motor).split(" or ")
+    elif not frames.hides_enabled(motor):
+        assert state.status == status
+    added = bytes([motor + (status << 4) & 0xFF]) + data[1:]  # firmware that adds where ids and states overlap
+    again = frames.decode_feedback(kind, added, motor)
+    assert again is not None
+    assert again.status == status
+
+
+@pytest.mark.parametrize(
+    ("version", "text"), [(942748471, "7318"), (5015, "5015"), (0, "0"), (0x20313337, "540095287")]
+)
+def test_a_firmware_version_is_shown_as_text_where_it_is_one(version: int, text: str) -> None:
+    assert frames.version_text(version) == text
+
+
 numbers = st.floats(-1e4, 1e4)
 kinds = st.sampled_from([frames.motor_type(name) for name in TYPES])
 
@@ -134,7 +177,7 @@ def test_a_command_comes_back_within_half_a_step_or_at_the_end_of_its_range(
         assert back == pytest.approx(min(max(value, low), high), abs=half * (1 + 1e-9))
 
 
-@given(st.integers(1, 15), st.sampled_from(sorted(frames.WHOLE)), st.integers(0, 2**32 - 1), st.booleans())
+@given(st.integers(1, 255), st.sampled_from(sorted(frames.WHOLE)), st.integers(0, 2**32 - 1), st.booleans())
 def test_registers_come_back(motor: int, register: int, value: int, written: bool) -> None:
     found = frames.decode_register(frames.register_reply(motor, register, value, written=written))
     assert found == (motor, register, value, written)

@@ -22,27 +22,42 @@ GAINS = (70.0, 70.0, 70.0, 60.0, 10.0, 10.0, 10.0)
 
 
 def made_axes(buses: Sequence[str] = ("unix:a", "unix:b")) -> tuple[Axis, ...]:
-    """Two arms of seven joints and a finger each."""
+    """Two arms of seven joints and a finger each; on one bus the second has the ids 9 to 16."""
     found = []
     for arm, bus in zip(("one", "two"), buses, strict=True):
+        first = 8 if arm == "two" and bus == buses[0] else 0
         for i, (kind, kp) in enumerate(zip(TYPES, GAINS, strict=True)):
             turn = -1.0 if i == 3 else 1.0
             limits = (-2.0, 2.0, 16.0, kp, 2.0 if kp > 10.0 else 0.6, 5.0 if kp > 10.0 else 1.5, 10.0)
-            found.append(Axis(f"{arm}_{i + 1}", arm, bus, i + 1, i + 17, kind, turn, 0.1 * i, *limits, grips=False))
+            found.append(
+                Axis(
+                    f"{arm}_{i + 1}", arm, bus, first + i + 1, first + i + 17, kind, turn, 0.1 * i, *limits, grips=False
+                )
+            )
         grip = (0.0, 0.044, 0.2, 0.0, 0.0, 0.0, 1.5)
-        found.append(Axis(f"{arm}_finger", arm, bus, 8, 24, "DM4310", -23.8, 0.0, *grip, grips=True))
+        found.append(
+            Axis(f"{arm}_finger", arm, bus, first + 8, first + 24, "DM4310", -23.8, 0.0, *grip, grips=True, unit="m")
+        )
     return tuple(found)
 
 
 class Bench:
     """A machine before emulated motors."""
 
-    def __init__(self, *, start: float = 0.3, weight: float = 0.0, last: dict[str, float] | None = None, **settings):
-        self.axes = made_axes()
+    def __init__(
+        self,
+        axes: Sequence[Axis] = (),
+        *,
+        start: float | Sequence[float] = 0.3,
+        weight: float = 0.0,
+        last: dict[str, float] | None = None,
+        **settings,
+    ):
+        self.axes = axes or made_axes()
         self.settings = Settings(**settings)
-        self.motors = [
-            EmulatedMotor(axis, (0.02 if axis.grips else start) * axis.ratio + axis.offset) for axis in self.axes
-        ]
+        if isinstance(start, float):
+            start = [0.02 if axis.grips else start for axis in self.axes]
+        self.motors = [EmulatedMotor(a, q * a.ratio + a.offset) for a, q in zip(self.axes, start, strict=True)]
         self.buses = EmulatedBuses(self.motors, seed=1)
         self.joints, self.weight = LooseJoints(self.motors, weight), weight
         self.machine = Machine(self.axes, self.settings, last)
@@ -98,9 +113,10 @@ class Bench:
 
     def exchange(self, sent: list[list[Frame]]) -> None:
         self.sent = sent
-        self.waiting = [
-            self.buses.take(bus, mine, self.now_ns) for bus, mine in zip(self.machine.buses, sent, strict=True)
-        ]
+        came = {bus: list[Frame]() for bus in self.machine.buses}
+        for bus, mine in zip(self.machine.buses, sent, strict=True):
+            came[bus] += self.buses.take(bus, mine, self.now_ns)
+        self.waiting = [came[bus] for bus in self.machine.buses]
 
     def move(self, speed: float) -> None:
         """Let the client move all joints at a speed, with their weights carried; the fingers stay."""

@@ -39,7 +39,7 @@ GUARD_S = 60.0
 class Rig:
     """Emulated motors, and servos before them."""
 
-    def __init__(self, folder: Path, axes: tuple[Axis, ...] = ()) -> None:
+    def __init__(self, folder: Path, axes: tuple[Axis, ...] = (), **options: Any) -> None:
         self.axes = axes or made_axes((f"unix:{folder}/a", f"unix:{folder}/b"))
         self._emulator = subprocess.Popen(
             [sys.executable, "-m", "openarm_hardware.emulator"],
@@ -48,7 +48,7 @@ class Rig:
             bufsize=0,
         )
         start = {axis.joint: 0.02 if axis.grips else 0.3 for axis in self.axes}
-        self._write(request(self.axes, start, weight=0.0))
+        self._write(request(self.axes, start, weight=0.0, **options))
         self._read()
         self.servos = list[ServoProcess]()
 
