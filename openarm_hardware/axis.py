@@ -19,7 +19,7 @@ _ENCODER_SLACK = 0.05
 _NEAR = 0.5
 #: Torque that moves any joint against its friction, N m.
 _STICTION = 3.0
-_RANGES = (Register.PMAX, Register.VMAX, Register.TMAX)
+_RANGES = {Register.PMAX: "rad", Register.VMAX: "rad/s", Register.TMAX: "N m"}
 
 
 class MotorAxis:
@@ -132,7 +132,9 @@ class MotorAxis:
     def warm(self) -> str:
         """Why it is too hot; else nothing."""
         hottest = max(self.mosfet, self.rotor)
-        return f"{self.axis} is at {hottest} °C, expected below {self._settings.hot}" * (hottest >= self._settings.hot)
+        return f"{self.axis} is at {hottest} °C, expected below {self._settings.hot} °C" * (
+            hottest >= self._settings.hot
+        )
 
     def place(self, last: float | None) -> str:
         """Find the turn with which the joint is within its limits; return why that is not known, else nothing.
@@ -193,11 +195,12 @@ class MotorAxis:
     @property
     def scaled(self) -> str:
         """Why its frames mean something else than is assumed; else nothing."""
-        for key in _RANGES:
+        for key, unit in _RANGES.items():
             found = self.registers.get(key)
             if found is not None and abs(found - self._wanted[key]) > 1e-3:
                 text = f"{self.axis} has register {Register(key).name} = {found:g}, a {self.kind.name} has"
-                return f"{text} {self._wanted[key]:g}; its type in hardware.yaml is wrong, or the register was changed"
+                why = "its type in hardware.yaml is wrong, or the register was changed"
+                return f"{text} {self._wanted[key]:g} {unit}; {why}"
         return ""
 
     def configure(self, *, write: bool) -> Frame:

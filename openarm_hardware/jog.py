@@ -14,6 +14,7 @@ from openarm_common.motors.axis import Axis
 from openarm_common.robot.servos import ArmLoad
 from openarm_common.types import Array
 from openarm_hardware.arm import Phase
+from openarm_hardware.axis import turn_text
 from openarm_hardware.client import ServoProcess
 from openarm_hardware.exchange import State
 from openarm_hardware.settings import Settings
@@ -37,6 +38,7 @@ class Jogged:
         others: By so much another joint of the arm was off its place, at most, rad.
         hottest: Of the motors, °C.
         scheduling: How they were commanded.
+        turns: Which motors lost a turn, a sentence each.
     """
 
     start: float
@@ -45,6 +47,7 @@ class Jogged:
     others: float
     hottest: int
     scheduling: str
+    turns: tuple[str, ...]
 
 
 class Jog:
@@ -85,14 +88,16 @@ class Jog:
             self._start = np.array([motor.command for motor in state.motors])
             axis, start = self._axes[self._at], float(self._start[self._at])
             if not axis.lower <= start + radians <= axis.upper:
-                limits = f"{axis.lower:.3f} to {axis.upper:.3f}"
-                text = f"{axis.joint} is at {start:.3f}; {start + radians:.3f} is beyond {limits}"
+                limits = f"{axis.lower:.3f} to {axis.upper:.3f} rad"
+                text = f"{axis.joint} is at {start:.3f} rad; {start + radians:.3f} rad is beyond {limits}"
                 raise OpenArmError(Code.LIMITS, text)
             there = self._go(servo, start, start + radians)
             others = max(abs(there.motors[i].q - self._start[i]) for i in self._arm if i != self._at)
             back = self._go(servo, start + radians, start)
             q = [state.motors[self._at].q for state in (state, there, back)]
-            return Jogged(q[0], q[1], q[2], float(others), self._hottest, servo.scheduling)
+            said = (turn_text(a, m.q, m.turn) for a, m in zip(self._axes, state.motors, strict=True))
+            turns = tuple(filter(None, said))
+            return Jogged(q[0], q[1], q[2], float(others), self._hottest, servo.scheduling, turns)
         finally:
             servo.close()
 

@@ -146,7 +146,7 @@ def jog(joint: str, degrees: float, *, emulated: Emulated = False) -> Outcome:
         f"{joint} went {there:.2f}° there and was {back:+.2f}° off its place back; other joints moved by up to"
         f" {math.degrees(found.others):.2f}°; {found.hottest} °C; {found.scheduling}"
     )
-    return Outcome(True, message, data=vars(found))
+    return Outcome(True, message, data=vars(found), text="\n".join(found.turns))
 
 
 @hardware.command

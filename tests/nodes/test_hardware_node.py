@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +113,19 @@ def test_a_motor_s_fault_is_reported_by_name_refuses_goals_and_is_reset_when_it_
     bench.clear()
     bench.call(Trigger, "/openarm_hardware/reset")
     bench.ros.spin_until(lambda: bench.level() == b"\0", what="the arms are up again")
+
+
+@pytest.mark.requirement("R-08")
+def test_a_motor_that_lost_a_turn_is_said_and_its_joint_is_where_it_is(bench: Bench) -> None:
+    before = bench.arm
+    bench.inject("motor_fault", f"{{kind: turn, joint: {bench.ARM[0]}, value: 1}}")
+    bench.ros.spin_until(lambda: bench.report().get("right_phase") == "DAMPED", what="the reading jumps")
+    bench.call(Trigger, "/openarm_hardware/reset")
+    bench.ros.spin_until(lambda: "(a turn) was added" in bench.report().get(bench.ARM[0], ""), what="the turn is said")
+    bench.ros.spin_until(lambda: bench.level() == b"\0", what="the arms are up again")
+    assert bench.arm == pytest.approx(before, abs=0.05)
+    kept = json.loads((Path(bench.hardware.config.calibrations) / "last_posture_emulated.json").read_text())
+    assert kept["positions"][bench.ARM[0]] == pytest.approx(before[0], abs=0.1)
 
 
 @pytest.mark.long

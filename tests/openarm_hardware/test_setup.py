@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import errno
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,10 @@ import pytest
 from openarm_bringup.commands import hardware as commands
 from openarm_bringup.doctor.hardware import check_motors
 from openarm_common.errors import Code
+from openarm_common.motors.bus import Bus, Frame
 from openarm_common.motors.wiring import ArmWiring, Wiring, axes_of, load_wiring
 from openarm_common.robot.description import RobotDescription
+from openarm_hardware import scan
 from openarm_hardware.arm import Phase
 from openarm_hardware.client import check_load
 from openarm_hardware.scan import scanned, unset
@@ -88,8 +92,8 @@ def test_motors_fresh_from_the_factory_are_named_and_set_up(rig: Callable[..., R
 def test_an_id_is_changed_unless_another_motor_has_it(rig: Callable[..., Rig]) -> None:
     bench = rig(motors=8)
     bus = bench.axes[0].bus
-    change = {"offset": 0x10, "flexible": True}
-    set_id(bus, 3, 31, **change)
+    change = partial(set_id, bus, offset=0x10, flexible=True)
+    change(3, 31)
     assert [motor.id for motor in scanned([bus], wired())] == [1, 2, *range(4, 9), 31]
     bench.ask(fault="error", joint="one_5", value=12)
     for motor, to, code, text in (
@@ -100,7 +104,7 @@ def test_an_id_is_changed_unless_another_motor_has_it(rig: Callable[..., Rig]) -
         (3, 3, Code.NOT_READY, "motor 3 does not answer.*motors that do: 1, 2, 4"),
         (5, 9, Code.NOT_READY, "motor 5 is not off but rotor too hot"),
     ):
-        assert refused(text, set_id, bus, motor, to, **change).code is code
+        assert refused(text, change, motor, to).code is code
 
 
 @pytest.mark.parametrize("flexible", [True, False])
@@ -118,6 +122,21 @@ def test_a_bus_that_carries_the_other_kind_of_frames_is_said(rig: Callable[..., 
     servo = bench.servo(replace(PATIENT, flexible=flexible))
     bench.until(servo, lambda state: state.phases == UP)
     assert check_motors(bus, right).level == "note"
+
+
+def test_an_interface_that_takes_classic_frames_alone_is_silent_and_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Classic(Bus):
+        def receive(self) -> list[Frame]:
+            return []
+
+        def send(self, frames: Sequence[Frame]) -> int:
+            raise OSError(errno.EINVAL, "Invalid argument")
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(scan, "open_bus", lambda address, *, flexible: Classic(address))
+    assert scanned(["socketcan:can0"], wired()) == []
 
 
 def test_a_bus_without_motors_is_said_to_be_silent(rig: Callable[..., Rig]) -> None:
