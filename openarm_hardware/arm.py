@@ -89,6 +89,10 @@ class ArmMachine:
             why = motor.take(data, now_ns)
             if why and self.phase in ON:
                 self.fail(why, now_ns)
+            elif why and self.phase is Phase.SETTING:  # its power was off, or its zero was set: is all as it was found?
+                for one in self.motors:
+                    one.forget()
+                self._become(Phase.LOOKING, why, now_ns)
         for motor in self.motors:
             motor.account()
 
@@ -213,6 +217,8 @@ class ArmMachine:
 
     def _set(self, now_ns: int, command: Sequence[tuple[float, float]] | None) -> None:
         if silent := [motor for motor in self.motors if motor.gone]:
+            for motor in silent:
+                motor.forget()
             self._become(Phase.LOOKING, f"no reply of {_named(silent)}", now_ns)
         elif unset := [motor for motor in self.motors if not motor.configured]:
             self.text = f"setting mode and timeout of {_named(unset)}"

@@ -98,7 +98,9 @@ def unset(found: Iterable[Found], wiring: Wiring) -> list[str]:
     for (bus, reply), ids in shared.items():
         who = f"motors {', '.join(map(str, ids[:-1]))} and {ids[-1]} answer" if ids[1:] else f"motor {ids[0]} answers"
         todo = ", ".join(f"`openarm hardware set-id {bus} {motor}`" for motor in ids)
-        said.append(f"{who} on id {reply:#x}: not set up, expected {offset:#x} more than the motor's own; type {todo}")
+        said.append(
+            f"{who} on id {hex(reply) if reply else 0}: not set up, expected the motor's own and {offset:#x}; type {todo}"
+        )
     return said
 
 

@@ -55,9 +55,8 @@ class Bench:
     ):
         self.axes = axes or made_axes()
         self.settings = Settings(**settings)
-        if isinstance(start, float):
-            start = [0.02 if axis.grips else start for axis in self.axes]
-        self.motors = [EmulatedMotor(a, q * a.ratio + a.offset) for a, q in zip(self.axes, start, strict=True)]
+        at = [0.02 if a.grips else start for a in self.axes] if isinstance(start, float) else start
+        self.motors = [EmulatedMotor(a, q * a.ratio + a.offset) for a, q in zip(self.axes, at, strict=True)]
         self.buses = EmulatedBuses(self.motors, seed=1)
         self.joints, self.weight = LooseJoints(self.motors, weight), weight
         self.machine = Machine(self.axes, self.settings, last)

@@ -72,7 +72,7 @@ def test_motors_fresh_from_the_factory_are_named_and_set_up(rig: Callable[..., R
         bench.ask(fault="factory", joint=joint)
     answer = commands.scan((bus,))
     assert (answer.success, answer.code) == (False, Code.NOT_READY)
-    assert "motors 1 and 2 answer on id 0x0: not set up" in answer.message
+    assert "motors 1 and 2 answer on id 0: not set up" in answer.message
     assert f"`openarm hardware set-id {bus} 1`, `openarm hardware set-id {bus} 2`" in answer.message
     assert len(answer.data["motors"]) == 16
     assert "set-id" in check_motors(bus, wired()).advice

@@ -218,6 +218,22 @@ def test_a_motor_that_lost_its_power_and_a_turn_is_placed_again_at_the_reset() -
     assert bench.q() == pytest.approx(before, abs=0.05)
 
 
+@pytest.mark.parametrize("off_s", [0.0, 0.2])
+def test_power_that_goes_and_comes_before_the_start_is_noticed(off_s: float) -> None:
+    bench = Bench((shoulder(), *made_axes()[1:]), start=[-3.300, *(0.02 if a.grips else 0.3 for a in made_axes()[1:])])
+    bench.client = None
+    bench.run(0.4)
+    assert bench.phases == [Phase.SETTING, Phase.SETTING]
+    bench.buses.inject("power")
+    bench.run(off_s)
+    bench.buses.inject("clear")
+    bench.client = bench.here
+    bench.run(7.0)
+    assert bench.phases == UP, bench.machine.text
+    assert bench.machine.motors()[0].q == pytest.approx(-3.300, abs=1e-3)
+    assert all(motor.registers[9] == 4000 for motor in bench.motors[: 16 if off_s else 8])
+
+
 def test_sixteen_motors_of_one_bus_come_up_and_go_off_as_on_two() -> None:
     axes = made_axes(("unix:a", "unix:a"))
     assert axes[15].reply_id == 0x20
