@@ -98,9 +98,8 @@ def unset(found: Iterable[Found], wiring: Wiring) -> list[str]:
     for (bus, reply), ids in shared.items():
         who = f"motors {', '.join(map(str, ids[:-1]))} and {ids[-1]} answer" if ids[1:] else f"motor {ids[0]} answers"
         todo = ", ".join(f"`openarm hardware set-id {bus} {motor}`" for motor in ids)
-        said.append(
-            f"{who} on id {hex(reply) if reply else 0}: not set up, expected the motor's own and {offset:#x}; type {todo}"
-        )
+        on = f"id {hex(reply) if reply else 0}: not set up, expected the motor's own and {offset:#x}"
+        said.append(f"{who} on {on}; type {todo}")
     return said
 
 

@@ -209,10 +209,12 @@ def _check_ids(axes: Sequence[Axis]) -> None:
         for number, way in ((axis.id, "to"), (axis.reply_id, "from")):
             who = f"{way} {axis.joint} (motor {axis.id})"
             if (other := taken.setdefault((axis.bus, number), who)) != who:
+                mine = [x for x in axes if x.arm == axis.arm]
+                others = {n for x in axes if x.bus == axis.bus and x not in mine for n in (x.id, x.reply_id)}
+                free = [i for i in range(1, LAST_ID + 1) if not {i, i + axis.reply_id - axis.id} & others]
                 raise OpenArmError(
                     Code.CONFIG_INVALID,
                     f"frames {other} and {who} have the same id {number:#x} on {axis.bus}; in hardware.yaml give arm"
                     f" {axis.arm} a bus of its own, or other ids, as"
-                    f" `arms.{axis.arm}.ids: [9, 10, 11, 12, 13, 14, 15, 16]` (`openarm hardware set-id` sets them in"
-                    " the motors)",
+                    f" `arms.{axis.arm}.ids: {free[: len(mine)]}` (`openarm hardware set-id` sets them in the motors)",
                 )

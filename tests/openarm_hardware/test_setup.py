@@ -151,22 +151,24 @@ def test_a_bus_without_motors_is_said_to_be_silent(rig: Callable[..., Rig]) -> N
 
 def test_ids_are_those_of_each_arm_and_doubles_on_a_bus_are_refused() -> None:
     robot, wiring = RobotDescription.load(), load_wiring()
-    right, left = robot.arm_names
+    first, second = robot.arm_names
 
     def arms(**ids: tuple[int, ...]) -> Wiring:
         both = {arm: ArmWiring(bus="socketcan:can0", ids=ids.get(arm, ())) for arm in robot.arm_names}
         return wiring.model_copy(update={"arms": both})
 
-    axes = axes_of(arms(**{left: tuple(range(9, 17))}), robot)
+    axes = axes_of(arms(**{second: tuple(range(9, 17))}), robot)
     assert [axis.id for axis in axes] == list(range(1, 17))
-    assert {axis.bus for axis in axes_of(arms(**{left: tuple(range(9, 17))}), robot, {right: "a", left: "b"})} == {"a"}
+    assert {axis.bus for axis in axes_of(arms(**{second: tuple(range(9, 17))}), robot, {first: "a", second: "b"})} == {
+        "a"
+    }
     for wrong, texts in (
-        ((), (f"to {axes[0].joint} (motor 1) and to {axes[8].joint} (motor 1)", f"arms.{left}.ids: [9, 10, 11")),
+        ((), (f"to {axes[0].joint} (motor 1) and to {axes[8].joint} (motor 1)", f"arms.{second}.ids: [9, 10, 11")),
         (tuple(range(8, 16)), ("(motor 8)", "the same id 0x8 on socketcan:can0")),
         (tuple(range(17, 25)), (f"from {axes[0].joint} (motor 1) and to {axes[8].joint} (motor 17)",)),
         (tuple(range(9, 16)), ("has 7 values, expected 8: one for each joint, and the gripper's",)),
     ):
-        error = refused("hardware.yaml", axes_of, arms(**{left: wrong}), robot)
+        error = refused("hardware.yaml", axes_of, arms(**{second: wrong}), robot)
         assert error.code is Code.CONFIG_INVALID
         for text in texts:
             assert text in error.message
