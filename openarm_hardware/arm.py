@@ -17,7 +17,7 @@ from openarm_common.motors.frames import Status
 from openarm_hardware.axis import MotorAxis
 from openarm_hardware.settings import Settings
 
-#: Gains of an arm with a motor that lost a turn rise so many times slower.
+#: Gains of an arm that rests, with a motor that lost a turn, rise so many times slower.
 _CAREFUL = 10.0
 #: A motor that is not on after so long does not switch on, s.
 _ENABLE_S = 1.0
@@ -76,6 +76,8 @@ class ArmMachine:
         self._sinks = False
         #: A reset was asked for: errors of motors may be cleared, and where the arm is was looked at.
         self._clears = False
+        #: Time in which its gains rise.
+        self._ramp_s = settings.ramp_s
         #: Its motors were switched on here.
         self._was_on = False
 
@@ -233,6 +235,8 @@ class ArmMachine:
                 motor.hold()
                 motor.command = (motor.command[0], tau)
                 motor.hold()
+            careful = any(motor.turn for motor in self.motors) and not self._sinks
+            self._ramp_s = self._settings.ramp_s * (_CAREFUL if careful else 1.0)
             self._sinks = False
             self._was_on = True
             self._become(Phase.ENABLING, "", now_ns)
@@ -248,9 +252,8 @@ class ArmMachine:
             self.fail(f"{off[0].axis} does not switch on: {off[0].said}", now_ns)
 
     def _ramp(self, now_ns: int) -> None:
-        seconds = self._settings.ramp_s * (_CAREFUL if any(motor.turn for motor in self.motors) else 1.0)
         for motor in self.motors:
-            motor.share = min(1.0, motor.share + self._settings.period_s / seconds)
+            motor.share = min(1.0, motor.share + self._settings.period_s / self._ramp_s)
         if all(motor.share >= 1.0 for motor in self.motors):
             self._become(Phase.FOLLOWING, "", now_ns)
 
