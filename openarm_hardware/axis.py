@@ -132,9 +132,8 @@ class MotorAxis:
     def warm(self) -> str:
         """Why it is too hot; else nothing."""
         hottest = max(self.mosfet, self.rotor)
-        return f"{self.axis} is at {hottest} °C, expected below {self._settings.hot} °C" * (
-            hottest >= self._settings.hot
-        )
+        text = f"{self.axis} is at {hottest} °C, expected below {self._settings.hot} °C"
+        return text if hottest >= self._settings.hot else ""
 
     def place(self, last: float | None) -> str:
         """Find the turn with which the joint is within its limits; return why that is not known, else nothing.
@@ -179,7 +178,7 @@ class MotorAxis:
         axis, unit, around = self.axis, self.axis.unit, math.tau / abs(self.axis.ratio)
         at = f"{axis} reads {self._read:.3f} rad: its joint is at {' or '.join(f'{q:.3f}' for q in places)} {unit}"
         limits = f"its limits {axis.lower:.3f} to {axis.upper:.3f} {unit}"
-        if len(places) == 3 and not any(axis.lower - self._slack <= q <= axis.upper + self._slack for q in places):
+        if not axis.lower - self._slack <= places[0] <= axis.upper + self._slack:
             return f"{at}, all out of {limits}; bring it within them and reset, or, if it is: {self._rezero}"
         kept = "it was not seen before" if last is None else f"it was last seen at {last:.3f} {unit}"
         low, high = axis.upper + self._slack - around, axis.lower - self._slack + around

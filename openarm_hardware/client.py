@@ -22,8 +22,8 @@ from openarm_hardware.settings import Settings
 _START_S = 20.0
 #: Time of a frame with 8 bytes on the wire, with the stuffing that is usual, s: classic at 1 Mbit/s; CAN FD, data at 5.
 _CLASSIC_S, _FLEXIBLE_S = 120e-6, 55e-6
-#: Most of the time of a bus that commands and replies may take.
-_LOAD = 0.9
+#: Most of the time of a bus that commands and replies may take; the rest is for a stop and for who only asks.
+_LOAD = 0.7
 #: Longest reason of a stop, characters.
 _REASON = 300
 

@@ -107,7 +107,7 @@ def set_id(address: str, motor: int, to: int, offset: int, *, flexible: bool) ->
         replies, _ = asked(bus, {motor: found[motor]}, ())
         kind = next(iter(frames.MOTOR_TYPES.values()))  # of its status alone
         _off(f"motor {motor}", frames.decode_feedback(kind, replies.get(motor, b""), motor), motor)
-        bus.send([frames.write_register(motor, Register.MST_ID, to + offset)])
+        bus.send([frames.disable(motor), frames.write_register(motor, Register.MST_ID, to + offset)])
         bus.send([frames.write_register(motor, Register.ESC_ID, to), frames.store_registers(to)])
         time.sleep(_STORE_S)
         bus.receive()
