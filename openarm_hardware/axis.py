@@ -17,6 +17,8 @@ _ENCODER_SLACK = 0.05
 #: A motor whose position fits its joint's limits with several turns is the one that is within this of where the joint
 #: was last seen, rad of the motor.
 _NEAR = 0.5
+#: What is typed to go on.
+_RESET = "reset (`ros2 service call /openarm_hardware/reset std_srvs/srv/Trigger`)"
 #: Torque that moves any joint against its friction, N m.
 _STICTION = 3.0
 _RANGES = {Register.PMAX: "rad", Register.VMAX: "rad/s", Register.TMAX: "N m"}
@@ -166,7 +168,7 @@ class MotorAxis:
             return ""
         return (
             f"{axis} is at {self.q:.3f} {axis.unit} and was at {last:.3f} {axis.unit} when it was last seen, more than"
-            f" {most:g} {axis.unit} away; was it moved by hand, or has its zero jumped? Look, then reset"
+            f" {most:g} {axis.unit} away; was it moved by hand, or has its zero jumped? Look, then {_RESET}"
         )
 
     @property
@@ -179,10 +181,10 @@ class MotorAxis:
         at = f"{axis} reads {self._read:.3f} rad: its joint is at {' or '.join(f'{q:.3f}' for q in places)} {unit}"
         limits = f"its limits {axis.lower:.3f} to {axis.upper:.3f} {unit}"
         if not axis.lower - self._slack <= places[0] <= axis.upper + self._slack:
-            return f"{at}, all out of {limits}; bring it within them and reset, or, if it is: {self._rezero}"
+            return f"{at}, all out of {limits}; bring it within them and {_RESET}, or, if it is: {self._rezero}"
         kept = "it was not seen before" if last is None else f"it was last seen at {last:.3f} {unit}"
         low, high = axis.upper + self._slack - around, axis.lower - self._slack + around
-        by_hand = f"turn it by hand to between {low:.3f} and {high:.3f} {unit} and reset, or " * (low < high)
+        by_hand = f"turn it by hand to between {low:.3f} and {high:.3f} {unit} and {_RESET}, or " * (low < high)
         return f"{at}, by turns of its motor all within {limits}, and {kept}; {by_hand}{self._rezero}"
 
     # --- registers

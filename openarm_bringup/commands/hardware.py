@@ -98,10 +98,7 @@ def zero(*joints: str, yes: Annotated[bool, Parameter(negative=())] = False, emu
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}; there are: {', '.join(sorted(known))}")
     would = zeros(chosen, flexible=flexible, write=False)
     at = {axis.joint: 0.0 - axis.offset / axis.ratio for axis in chosen}
-    lines = [
-        f"{z.joint:<28} is at {z.before:8.4f} {z.unit}, will be {at[z.joint]:8.4f} {z.unit} where it is now"
-        for z in would
-    ]
+    lines = [f"{z.joint:<28} is at {z.before:8.4f} {z.unit}, will be {at[z.joint]:8.4f} {z.unit} there" for z in would]
     shown = console()
     shown.print("\n".join(lines), markup=False, highlight=False)
     if not yes:

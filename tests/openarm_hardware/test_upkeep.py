@@ -152,7 +152,7 @@ def test_commands_ask_before_they_set_a_zero_and_say_what_they_changed(
     assert still.before == pytest.approx(START, abs=1e-3)
     done = commands.zero(joint, yes=True, emulated=True)
     assert done.success
-    assert "was at   0.3000, is at   0.000" in done.text
+    assert "was at   0.3000 rad, is at   0.000" in done.text
     refused("no joint or arm 'elbow'; there are", commands.zero, "elbow", yes=True, emulated=True)
     record = commands.record_gains(tmp_path / "gains.json", emulated=True)
     assert record.success, record.message
