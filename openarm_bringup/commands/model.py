@@ -65,17 +65,22 @@ def new(
     edits: Path | None = None,
     samples: int = 60_000,
     out: Path | None = None,
+    arg: tuple[str, ...] = (),
+    package: tuple[str, ...] = (),
 ) -> Outcome:
     """Draft the folder of a robot, `models/robots/NAME`, from its maker's MJCF or URDF.
 
     Args:
         name: Of the robot.
         mjcf: The maker's MJCF.
-        urdf: The maker's URDF, in place of an MJCF.
+        urdf: The maker's URDF or xacro (`.xacro`), in place of an MJCF.
         arm: NAME=BASE_LINK:TIP_LINK of an arm: what it stands on, and its tool centre point; may be repeated.
-        edits: YAML of what the MJCF lacks: velocity limits, boxes, pads, frames.
+        edits: YAML of what the MJCF lacks: velocity limits, boxes, pads, frames; of a URDF, limits of joints.
         samples: Random states of the collision matrix.
         out: Folder in which the robot's folder is made; without one, `models/robots`.
+        arg: NAME:=VALUE of an argument of the xacro; may be repeated.
+        package: NAME=FOLDER of a package that `package://NAME` or `$(find NAME)` means, where it is neither above the
+            file nor installed; may be repeated.
     """
     from openarm_common.resources import models_dir
     from openarm_sim_bridge.drafting.check import folder_faults
@@ -87,11 +92,14 @@ def new(
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{name!r} names no robot, expected letters, digits and _")
     folder = (models_dir() / "robots" if out is None else out) / name
     source = mjcf or urdf or Path()
-    reasons = draft_folder(folder, source, dict(map(_arm, arm)), edits, samples)
-    always = sorted(" and ".join(sorted(pair)) for pair, reason in reasons.items() if reason == "Always")
+    arguments = dict(_pair("--arg", text, ":=", "NAME:=VALUE") for text in arg)
+    packages = {key: Path(at) for key, at in (_pair("--package", text, "=", "NAME=FOLDER") for text in package)}
+    draft = draft_folder(folder, source, dict(map(_arm, arm)), edits, samples, arguments, packages)
+    always = sorted(" and ".join(sorted(pair)) for pair, reason in draft.reasons.items() if reason == "Always")
     faults = folder_faults(folder)
-    data = {"folder": str(folder), "always_touching": always, "faults": faults}
-    lines = [f"allowed, since they touch in every random state: {pair}" for pair in always]
+    data = {"folder": str(folder), "always_touching": always, "remarks": list(draft.remarks), "faults": faults}
+    lines = [f"note: {remark}" for remark in draft.remarks]
+    lines += [f"allowed, since they touch in every random state: {pair}" for pair in always]
     text = "\n".join([*lines, *(f"to do: {fault}" for fault in faults)])
     return Outcome(True, f"drafted {folder}: {len(faults)} to do", data=data, text=text)
 
@@ -130,6 +138,14 @@ def check(name: str) -> Outcome:
         message = f"{name}: {len(faults)} {'fault' if len(faults) == 1 else 'faults'}"
         return Outcome(False, message, Code.CONFIG_INVALID, {"faults": faults}, text)
     return Outcome(True, f"{name}: nothing is wrong", data={"faults": []})
+
+
+def _pair(option: str, text: str, sign: str, form: str) -> tuple[str, str]:
+    """Read a name and a value, with a sign between them."""
+    name, found, value = text.partition(sign)
+    if not (name and found):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{option} {text!r}: expected {form}")
+    return name, value
 
 
 def _arm(text: str) -> tuple[str, tuple[str, str]]:

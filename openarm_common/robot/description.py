@@ -17,7 +17,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-import xacro
 
 from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError
@@ -29,6 +28,7 @@ from openarm_common.robot.meshes import take_meshes
 from openarm_common.robot.motors import JointMotion, Motors
 from openarm_common.robot.srdf import Semantics, parse_srdf, shifted
 from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf, rewritten
+from openarm_common.robot.xacro_files import description_text
 from openarm_common.robot.xml_text import fault, parse_root
 from openarm_common.robot.zeros import read_zeros, zeros_path
 from openarm_common.types import Array
@@ -117,7 +117,7 @@ class RobotDescription:
         for path in (urdf, *([] if srdf is None else [srdf])):
             if not is_file(path):
                 raise OpenArmError(Code.CONFIG_INVALID, f"there is no file {path}")
-        root = parse_root(_expanded(urdf) if urdf.suffix == ".xacro" else read_text(urdf), str(urdf))
+        root = parse_root(description_text(urdf, packages=packages), str(urdf))
         hulls = take_meshes(root, urdf, packages)
         ET.indent(root)
         text = ET.tostring(root, encoding="unicode") + "\n"  # drops xacro's comments, which name the folder it ran in
@@ -430,13 +430,6 @@ def _loaded(folder: Path, name: str, zeros: str) -> RobotDescription:
             raise OpenArmError(Code.CONFIG_INVALID, f"{zeros} {text}")
         return _loaded(folder, name, "").with_zeros(held.offsets)
     return RobotDescription.from_folder(name)
-
-
-def _expanded(source: Path) -> str:
-    try:
-        return xacro.process_file(str(source)).toxml()
-    except xacro.XacroException as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{source}: {error}") from error
 
 
 def part_faults(parts: RobotFolder, robot: RobotDescription) -> list[str]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.resources import is_file
 from openarm_common.robot.urdf import Primitive, origin
@@ -23,17 +24,16 @@ _PACKAGE, _FILE = "package://", "file://"
 #: How far corners of a convex mesh may be outside the plane of a triangle, and how low a triangle may be that says
 #: nothing about its plane: shares of the mesh's diagonal.
 _FLAT, _SLIVER = 1e-4, 1e-3
+#: Distances of corners to planes that are in memory at once.
+_BLOCK = 1_000_000
 
 
 def mesh_file(name: str, urdf: Path, packages: Mapping[str, Path] | None = None) -> Path:
     """Find the file of a mesh.
 
-    The folder of `package://NAME/` is that of `packages`, or else `NAME` in `share` of the Python environment or of a
-    prefix in AMENT_PREFIX_PATH, or in the tree of the Python package NAME.
-
     Args:
         name: As the URDF says it: a path, absolute or from the folder of the URDF, `file://PATH`, or
-            `package://NAME/PATH`.
+            `package://NAME/PATH`; see `package_folders`.
         urdf: File of the description.
         packages: Folders of packages by name.
 
@@ -46,16 +46,20 @@ def mesh_file(name: str, urdf: Path, packages: Mapping[str, Path] | None = None)
             raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: there is no mesh {path}")
         return path
     package, _, rest = name.removeprefix(_PACKAGE).partition("/")
-    tried = [folder / rest for folder in _folders(package, packages or {})]
+    tried = [folder / rest for folder in package_folders(package, urdf, packages or {})]
     for path in tried:
         if is_file(path):
             return path
     places = ", ".join(map(str, dict.fromkeys(tried)))
     raise OpenArmError(
         Code.CONFIG_INVALID,
-        f"{urdf}: there is no mesh {name!r}; tried {places}; install package {package!r}, or name its prefix in"
-        " AMENT_PREFIX_PATH",
+        f"{urdf}: there is no mesh {name!r}; tried {places}; {package_advice(package)}",
     )
+
+
+def package_advice(package: str) -> str:
+    """Return what to do where a package is not found."""
+    return f"name its folder by --package {package}=FOLDER of `openarm model new`, or its parent in ROS_PACKAGE_PATH"
 
 
 def take_meshes(
@@ -147,7 +151,10 @@ def read_mesh(path: Path, scale: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def is_convex(vertices: Array, triangles: NDArray[np.int64]) -> bool:
-    """Whether no vertex (n, 3) is beyond the plane of a triangle (m, 3), be it turned outwards or inwards."""
+    """Whether no vertex (n, 3) is beyond the plane of a triangle (m, 3), be it turned outwards or inwards.
+
+    What is flat is not: it has no volume.
+    """
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     normal = np.cross(b - a, c - a)
@@ -157,21 +164,58 @@ def is_convex(vertices: Array, triangles: NDArray[np.int64]) -> bool:
     if not telling.any():
         return False
     unit = normal[telling] / twice[telling, None]
-    off = unit @ vertices.T - np.einsum("ij,ij->i", unit, a[telling])[:, None]
-    beyond = np.minimum(off.max(axis=1), -off.min(axis=1))
-    return bool((beyond <= _FLAT * size).all())
+    level = np.einsum("ij,ij->i", unit, a[telling])
+    step = max(1, _BLOCK // len(vertices))
+    for first in range(0, len(unit), step):
+        off = unit[first : first + step] @ vertices.T - level[first : first + step, None]
+        above, below = off.max(axis=1), -off.min(axis=1)
+        if (np.minimum(above, below) > _FLAT * size).any() or (np.maximum(above, below) <= _FLAT * size).any():
+            return False
+    return True
 
 
 def _absolute(path: Path) -> str:
     return f"{_FILE}{path.resolve()}"
 
 
-def _folders(package: str, packages: Mapping[str, Path]) -> Iterator[Path]:
-    """Yield folders that `package://` may mean."""
+def package_folders(package: str, source: Path, packages: Mapping[str, Path]) -> Iterator[Path]:
+    """Yield folders that may be a package, the likeliest first.
+
+    They are: that of `packages`; one above the source whose `package.xml` or own name says so, or `package` in one of
+    them; `package` in a folder of ROS_PACKAGE_PATH, or such a folder itself; `package` in `share` of the Python
+    environment or of a prefix in AMENT_PREFIX_PATH; the same in the tree of the Python package of that name.
+
+    Args:
+        package: Name of the package.
+        source: File of the description.
+        packages: Folders of packages by name.
+    """
     if package in packages:
         yield packages[package]
+    for parent in source.absolute().parents:
+        if package in (parent.name, _package_name(parent)):
+            yield parent
+        if os.path.isdir(parent / package):
+            yield parent / package
+    for folder in map(Path, filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep))):
+        yield folder if package in (folder.name, _package_name(folder)) else folder / package
     prefixes = [sys.prefix, *filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))]
     yield from (Path(prefix) / "share" / package for prefix in prefixes)
+    yield from _installed(package)
+
+
+def _package_name(folder: Path) -> str:
+    """Return the name that the `package.xml` of a folder says; "" without one."""
+    if not is_file(folder / "package.xml"):
+        return ""
+    try:
+        return (ET.fromstring(read_text(folder / "package.xml")).findtext("name") or "").strip()
+    except (ET.ParseError, OpenArmError):
+        return ""  # it says no name
+
+
+def _installed(package: str) -> Iterator[Path]:
+    """Yield folders in the tree of the Python package of this name."""
     spec = importlib.util.find_spec(package) if package.isidentifier() else None
     for place in (spec.submodule_search_locations or ()) if spec is not None else ():
         yield Path(place)

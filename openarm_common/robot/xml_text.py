@@ -49,6 +49,12 @@ def attribute(element: ET.Element, key: str) -> str:
     return value
 
 
+def child(element: ET.Element, tag: str) -> ET.Element:
+    """Return the child of this tag, which is made where there is none."""
+    found = element.find(tag)
+    return ET.SubElement(element, tag) if found is None else found
+
+
 def floats(text: str, count: int, element: ET.Element) -> tuple[float, ...]:
     """Read `count` finite numbers; `element` is named in the error."""
     try:

@@ -3,13 +3,10 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
-
-import mujoco
 
 from openarm_common.config import read_text
 from openarm_common.errors import OpenArmError, said
@@ -17,6 +14,7 @@ from openarm_common.robot.description import RobotDescription, part_faults
 from openarm_common.robot.folder import RobotFolder, read_folder
 from openarm_common.robot.meshes import mesh_file
 from openarm_sim_bridge.drafting.collisions import LinkContacts
+from openarm_sim_bridge.world.model import import_urdf
 
 #: How far a posture may be outside of a limit, which has fewer digits in other files, rad.
 _ROUNDED = 1e-5
@@ -68,13 +66,14 @@ def _mesh_faults(robot: RobotDescription, urdf: Path) -> Iterator[str]:
 
 
 def _limit_faults(robot: RobotDescription) -> Iterator[str]:
-    for joint in robot.joints.values():
-        if joint.type == "fixed" or joint.mimic is not None:
-            continue
-        for what, value in (("velocity", joint.velocity), ("effort", joint.effort)):
-            if not math.isfinite(value) or value <= 0.0:
-                given = "no limit" if math.isinf(value) else f"the limit {value:g}"
-                yield f"joint {joint.name!r} has {given} of {what}, expected one > 0"
+    joints = [joint for joint in robot.joints.values() if joint.type != "fixed" and joint.mimic is None]
+    for what in ("velocity", "effort"):
+        values = {joint.name: float(getattr(joint, what)) for joint in joints}
+        lacking = [name for name, value in values.items() if not math.isfinite(value) or value <= 0.0]
+        if lacking:
+            given = ", ".join(f"{name} ({values[name]:g})" for name in lacking)
+            way = f'for all of them in <limit> of the URDF, or by `{what}: {{"*": NUMBER}}` in --edits of a new draft'
+            yield f"joints without a limit of {what} > 0: {given}; give it {way}"
 
 
 def _pad_faults(parts: RobotFolder, robot: RobotDescription) -> Iterator[str]:
@@ -109,17 +108,9 @@ def _posture_faults(robot: RobotDescription, contacts: LinkContacts) -> Iterator
 
 
 def _mujoco_faults(robot: RobotDescription, urdf: Path) -> Iterator[str]:
-    root = ET.fromstring(robot.urdf)
-    try:
-        files = {mesh_file(mesh.get("filename", ""), urdf) for mesh in root.findall("link/*/geometry/mesh")}
-    except OpenArmError:
+    if any(_mesh_faults(robot, urdf)):
         return  # said already
-    for a, b in itertools.combinations(sorted(files), 2):
-        if a.name == b.name:
-            yield f"MuJoCo takes meshes {a} and {b} for one, by their names"
-    ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", fusestatic="false", discardvisual="false")
     try:
-        text = ET.tostring(root, encoding="unicode")
-        mujoco.MjSpec.from_string(text, assets={path.name: path.read_bytes() for path in files}).compile()
-    except ValueError as error:
-        yield f"MuJoCo does not read the URDF: {error}"
+        import_urdf(robot).compile()
+    except (OpenArmError, ValueError) as error:
+        yield f"MuJoCo does not read the URDF: {said(error)}"

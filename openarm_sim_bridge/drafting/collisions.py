@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import coal
 import numpy as np
@@ -18,6 +18,10 @@ from openarm_common.types import Array
 Pair = frozenset[str]
 #: States in which links must touch that always do.
 _ALWAYS = 1000
+#: Most triangles of a coarse hull, and grids that its corners move to, m.
+_HULL_FACES, _GRIDS = 300, (0.001, 0.002, 0.003, 0.004, 0.006, 0.008, 0.012)
+#: Most triangles at a corner that coal takes.
+_NEIGHBOURS = 255
 
 
 class LinkContacts:
@@ -121,7 +125,7 @@ class LinkContacts:
 def coal_shape(shape: Primitive) -> coal.CollisionGeometry:
     """Return a shape for coal, in its own frame."""
     if shape.corners is not None:
-        points, triangles = hull_mesh(shape.corners)
+        points, triangles = coarse_hull(shape.corners, _fits_coal)
         corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
         corners.extend(list(points))
         faces.extend([coal.Triangle(*triangle) for triangle in triangles.tolist()])
@@ -129,6 +133,10 @@ def coal_shape(shape: Primitive) -> coal.CollisionGeometry:
     if shape.kind == "box":
         return coal.Box(*shape.size)
     return coal.Cylinder(*shape.size) if shape.kind == "cylinder" else coal.Sphere(*shape.size)
+
+
+def _fits_coal(triangles: NDArray[np.int64]) -> bool:
+    return int(np.bincount(triangles.ravel()).max()) <= _NEIGHBOURS
 
 
 def hull_mesh(points: Array) -> tuple[Array, NDArray[np.int64]]:
@@ -141,6 +149,21 @@ def hull_mesh(points: Array) -> tuple[Array, NDArray[np.int64]]:
     triangles = index[hull.simplices]
     triangles[inwards] = triangles[inwards][:, ::-1]
     return points[hull.vertices], triangles
+
+
+def coarse_hull(
+    points: Array, enough: Callable[[NDArray[np.int64]], bool] = lambda triangles: len(triangles) <= _HULL_FACES
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return the hull of points, moved outwards to a grid until its triangles are `enough`; see `hull_mesh`."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    out = hull_mesh(points)
+    for cell in _GRIDS:
+        if enough(out[1]):
+            break
+        away = points - middle
+        moved = middle + np.sign(away) * np.ceil(np.abs(away) / cell) * cell
+        out = hull_mesh(np.unique(moved.round(6), axis=0))
+    return out
 
 
 def adjacent_pairs(description: RobotDescription) -> set[Pair]:

@@ -3,21 +3,25 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import shutil
-import xml.etree.ElementTree as ET
+import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import yaml
 
-from openarm_common.config import load_config, read_text
+from openarm_common import se3
+from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Joint, RobotDescription
-from openarm_common.robot.meshes import mesh_file
-from openarm_common.robot.xml_text import parse_root
 from openarm_common.types import Array
+from openarm_sim_bridge.drafting.adopted import AdoptedUrdf
 from openarm_sim_bridge.drafting.edits import Edits
 from openarm_sim_bridge.drafting.mjcf import UrdfDraft, compiled
 from openarm_sim_bridge.drafting.semantics import SOURCE, write_srdf
@@ -25,6 +29,8 @@ from openarm_sim_bridge.drafting.semantics import SOURCE, write_srdf
 _HEAD = """# SPDX-License-Identifier: Apache-2.0
 # Drafted by `openarm model new` from {source}: review it, then ask `openarm model check`.
 """
+_NOTHING: Mapping[str, str] = MappingProxyType({})
+_NOWHERE: Mapping[str, Path] = MappingProxyType({})
 _LICENCE = "<!-- SPDX-License-Identifier: Apache-2.0 -->\n"
 
 
@@ -35,24 +41,40 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
+@dataclass(frozen=True)
+class Draft:
+    """What is to know of a draft.
+
+    Attributes:
+        reasons: Why each pair of links in the SRDF may touch.
+        remarks: What was left out or guessed, a sentence each.
+    """
+
+    reasons: Mapping[frozenset[str], str]
+    remarks: tuple[str, ...]
+
+
 def draft_folder(
     folder: Path,
     source: Path,
     arms: Mapping[str, tuple[str, str]],
     edits: Path | None = None,
     samples: int = 60_000,
-) -> dict[frozenset[str], str]:
+    arguments: Mapping[str, str] = _NOTHING,
+    packages: Mapping[str, Path] = _NOWHERE,
+) -> Draft:
     """Write `robot.yaml`, URDF, meshes, `semantics.yaml` and SRDF of a robot.
+
+    A draft that fails leaves nothing.
 
     Args:
         folder: To make; what it is called is the robot's name.
-        source: MJCF (`.xml`) or URDF.
+        source: MJCF (`.xml`), URDF, or xacro (`.xacro`).
         arms: By name: link that the arm stands on, and link of its tool centre point.
-        edits: YAML of `Edits`; with an MJCF only.
+        edits: YAML of `Edits`.
         samples: Random states of the collision matrix, unless the folder has a `semantics.yaml` already.
-
-    Returns:
-        Why each pair of links in the SRDF may touch.
+        arguments: Of xacro, by name.
+        packages: Folders of packages that a URDF names, by name.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the folder has a robot, or an arm names a link that the robot does not
@@ -63,34 +85,64 @@ def draft_folder(
         raise OpenArmError(Code.INVALID_ARGUMENT, text)
     if not arms:
         raise OpenArmError(Code.INVALID_ARGUMENT, "expected at least one arm, as NAME=BASE_LINK:TIP_LINK")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    # next to the folder, since files of a robot may be named from there
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}_") as place:
+        work = Path(place)
+        if (folder / SOURCE).exists():
+            shutil.copy(folder / SOURCE, work)
+        draft = _drafted(work, folder.name, source, arms, edits, samples, arguments, packages)
+        folder.mkdir(exist_ok=True)
+        shutil.copytree(work, folder, dirs_exist_ok=True, copy_function=shutil.move)
+        folder.chmod(0o755)
+    return draft
+
+
+def _drafted(
+    folder: Path,
+    name: str,
+    source: Path,
+    arms: Mapping[str, tuple[str, str]],
+    edits: Path | None,
+    samples: int,
+    arguments: Mapping[str, str],
+    packages: Mapping[str, Path],
+) -> Draft:
+    """Draft a robot of this name in a folder that is there; see `draft_folder`."""
     wanted = Edits() if edits is None else load_config(edits, Edits)
-    folder.mkdir(parents=True, exist_ok=True)
-    urdf = folder / f"{folder.name}.urdf"
+    urdf = folder / f"{name}.urdf"
+    remarks: list[str] = []
     if source.suffix == ".xml":
         shared = folder.parent / wanted.meshes if wanted.meshes else None
         if shared is not None and not (shared / "robot.yaml").is_file():
-            text = f"{edits}:meshes: there is no robot {wanted.meshes[:80]!r} next to {folder}"
+            text = f"{edits}:meshes: there is no robot {wanted.meshes[:80]!r} next to {folder.parent / name}"
             raise OpenArmError(Code.CONFIG_INVALID, text)
-        draft = UrdfDraft(folder.name, compiled(source, wanted), wanted, shared)
+        draft = UrdfDraft(name, compiled(source, wanted), wanted, shared)
         draft.meshes.write(folder, wanted.triangles, wanted.detail)
         urdf.write_text(draft.text().replace("\n", f"\n{_LICENCE}", 1), encoding="utf-8")
     else:
-        if edits is not None:
-            raise OpenArmError(Code.INVALID_ARGUMENT, "edits are of an MJCF; change the URDF itself")
-        urdf.write_text(_adopted(source, folder), encoding="utf-8")
+        adopted = AdoptedUrdf(source, folder, wanted, arguments, packages)
+        remarks += adopted.remarks
+        urdf.write_text(adopted.text(), encoding="utf-8")
     robot = RobotDescription.from_files(urdf)
-    parts = {name: arm_parts(robot, name, base, tip) for name, (base, tip) in arms.items()}
+    parts: dict[str, dict[str, Any]] = {}
+    for arm, (base, tip) in arms.items():
+        parts[arm], guesses = arm_parts(robot, arm, base, tip)
+        remarks += guesses
     base = wanted.base if source.suffix == ".xml" else robot.root
     signs = mirror_signs(robot, [part["joints"] for part in parts.values()])
-    content = {"urdf": urdf.name, "srdf": f"{folder.name}.srdf", "base": base, "arms": parts, "mirror": signs}
+    content = {"urdf": urdf.name, "srdf": f"{name}.srdf", "base": base, "arms": parts, "mirror": signs}
     _write_yaml(folder / "robot.yaml", source, content)
     if not (folder / SOURCE).exists():
         _write_yaml(folder / SOURCE, source, _first_semantics(robot, parts) | {"samples": samples})
-    return write_srdf(folder)[1]
+    return Draft(write_srdf(folder)[1], tuple(remarks))
 
 
-def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> dict[str, Any]:
-    """Return an arm as `robot.yaml` has it; fingers are what moves beyond the arm's last joint.
+def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return an arm as `robot.yaml` has it, and what of it is a guess, a sentence each.
+
+    Fingers are what a joint with limits moves beyond the arm's last joint: rather one that others follow, then one that
+    slides.
 
     Args:
         robot: The robot.
@@ -112,17 +164,38 @@ def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> dict[s
         for joint in robot.joints.values()
         if joint.type != "fixed" and joint not in chain and flange in {joint.parent, *_links_to(robot, joint.parent)}
     ]
-    leader = next((joint for joint in beyond if _leads(joint)), None)
-    moved = [joint for joint in beyond if leader is not None and leader.name in (joint.name, joint.mimic)]
-    return {
+    followers = {joint.name: [other for other in beyond if other.mimic == joint.name] for joint in beyond}
+    leaders = [joint for joint in beyond if _leads(joint) and -math.inf < joint.lower < joint.upper < math.inf]
+    leaders.sort(key=lambda joint: (not followers[joint.name], joint.type != "prismatic"))
+    leader = leaders[0] if leaders else None
+    moved = [] if leader is None else [leader, *followers[leader.name]]
+    others = [joint.name for joint in beyond if joint not in moved]
+    remarks: list[str] = []
+    if leader is not None and others:
+        what = f"arms.{name}: finger_joint {leader.name!r} is a guess; further joints of the hand: {', '.join(others)}"
+        remarks.append(f"{what}; change finger_joint and fingers in robot.yaml where another one drives the hand")
+    elif others:
+        what = f"arms.{name}: no joint of the hand has limits, so it has no fingers: {', '.join(others)}"
+        remarks.append(f"{what}; give one limits, then draft again")
+    if len(moved) == 1:
+        what = f"arms.{name}: {moved[0].name!r} moves one finger, {moved[0].child!r}"
+        remarks.append(f"{what}; where the other is a part of {moved[0].parent!r}, add that to fingers in robot.yaml")
+    parts = {
         "base": base,
         "joints": [joint.name for joint in joints],
         "flange": flange,
         "hand": leader.parent if leader is not None else chain[-1].parent,
         "tcp": tip,
         "finger_joint": leader.name if leader is not None else "",
-        "fingers": [joint.child for joint in moved],
+        "fingers": _ends(robot, [joint.child for joint in moved]),
     }
+    return parts, tuple(remarks)
+
+
+def _ends(robot: RobotDescription, links: list[str]) -> list[str]:
+    """Links that most of the others carry: the fingers of a linkage, not what moves them."""
+    carried = {link: len(_links_to(robot, link) & set(links)) for link in links}
+    return [link for link in links if carried[link] == max(carried.values())]
 
 
 def mirror_signs(robot: RobotDescription, arms: list[list[str]]) -> list[int]:
@@ -136,13 +209,14 @@ def mirror_signs(robot: RobotDescription, arms: list[list[str]]) -> list[int]:
     signs: list[int] = []
     for first, second in zip(*arms, strict=True):
         (T, a), (S, b) = ((_at(robot, robot.joints[joint], zero)) for joint in (first, second))
-        if not np.allclose(T * (1.0, -1.0, 1.0), S, atol=1e-4):
-            return []
-        along = float((a * (1.0, -1.0, 1.0)) @ b)
-        if abs(along) < 0.999:
-            return []
+        image = a * (1.0, -1.0, 1.0)
         slides = robot.joints[first].type == "prismatic"
-        signs.append(round(along) if slides else -round(along))
+        # the place along an axis says nothing, and that of a slide neither
+        away = 0.0 if slides else float(np.linalg.norm(np.cross(T * (1.0, -1.0, 1.0) - S, b)))
+        if robot.joints[second].type != robot.joints[first].type or away > 1e-4 or abs(image @ b) < 0.999:
+            return []
+        along = round(float(image @ b))
+        signs.append(along if slides else -along)
     return signs
 
 
@@ -160,30 +234,6 @@ def _links_to(robot: RobotDescription, link: str) -> set[str]:
     return {joint.child for joint in robot.chain(link)}
 
 
-def _adopted(source: Path, folder: Path) -> str:
-    """URDF text with a name for each shape, and mesh files in its folder; those of packages stay there."""
-    root = parse_root(read_text(source), str(source))
-    taken = {shape.get("name") for tag in ("visual", "collision") for shape in root.findall(f"link/{tag}")}
-    for link in root.findall("link"):
-        for tag in ("visual", "collision"):
-            for piece, shape in enumerate(link.findall(tag)):
-                if shape.get("name") is None:
-                    name = f"{link.get('name')}_{piece:02d}_{tag}"
-                    shape.set("name", name if name not in taken else f"{name}_{len(taken)}")
-    for tag in ("visual", "collision"):
-        for mesh in root.findall(f"link/{tag}/geometry/mesh"):
-            name = mesh.get("filename", "")
-            path = mesh_file(name, source)
-            if name.startswith("package://"):
-                continue
-            target = folder / "meshes" / tag / path.name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, target)
-            mesh.set("filename", str(target.relative_to(folder)))
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode") + "\n"
-
-
 def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Postures to begin with: all joints as near to 0 as their limits let them, the fingers at both ends."""
     zero = {
@@ -194,11 +244,23 @@ def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, A
     for name, arm in parts.items():
         if arm["finger_joint"]:
             joint = robot.joints[arm["finger_joint"]]
-            closed, opened = sorted((joint.lower, joint.upper), key=abs)
-            ends["open"][name], ends["closed"][name] = opened, closed
+            ends["closed"][name], ends["open"][name] = sorted(
+                (joint.lower, joint.upper), key=lambda q: (round(_gap(robot, arm, q), 6), abs(q))
+            )
     touching = [list(arm["fingers"][k : k + 2]) for arm in parts.values() for k in range(len(arm["fingers"]) - 1)]
     gripper = ends if any(ends.values()) else {}
     return {"postures": {"home": zero, "zero": zero}, "gripper": gripper, "may_touch": touching}
+
+
+def _gap(robot: RobotDescription, arm: Mapping[str, Any], position: float) -> float:
+    """Mean distance of an arm's fingers, or of its only one from the tool centre point, m."""
+    poses = robot.link_poses({**dict.fromkeys(robot.joints, 0.0), arm["finger_joint"]: position})
+    middles = [poses[arm["tcp"]][:3, 3]] if len(arm["fingers"]) == 1 else []
+    for finger in arm["fingers"]:
+        shapes = robot.links[finger].collision
+        places = [shape.T_link_primitive[:3, 3] for shape in shapes] or [np.zeros(3)]
+        middles.append(se3.apply(poses[finger], np.mean(places, axis=0)[None])[0])
+    return float(np.mean([np.linalg.norm(a - b) for a, b in itertools.combinations(middles, 2)]))
 
 
 def _write_yaml(path: Path, source: Path, content: Mapping[str, Any]) -> None:

@@ -16,7 +16,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.meshes import read_mesh
 from openarm_common.types import Array
-from openarm_sim_bridge.drafting.collisions import hull_mesh
+from openarm_sim_bridge.drafting.collisions import coarse_hull, hull_mesh
 from openarm_sim_bridge.drafting.edits import matching
 
 Triangles = NDArray[np.int64]
@@ -26,10 +26,10 @@ _LEAST = 60
 #: longer; the next where a mesh, torn or of many shells, keeps too many triangles.
 _ATTEMPTS = ((2, 1e-6), (5, 1e-6), (5, 5e-4), (8, 1e-3), (8, 2e-3))
 _ENOUGH = 1.2
-#: Most triangles of the hull around a mesh that is made to be seen, and grids that its corners move to, m.
-_HULL_FACES, _GRIDS = 300, (0.001, 0.002, 0.003, 0.004, 0.006, 0.008, 0.012)
 #: Extents of a mesh and of its simplification differ by less, m.
 _ALIKE = 0.002
+#: Most triangles of a mesh that MuJoCo reads.
+MOST = 200_000
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -125,19 +125,6 @@ class MeshFiles:
         return f"meshes/{'visual' if seen else 'collision'}/{f'{stem}_{number}' if number else stem}.stl"
 
 
-def coarse_hull(points: Array) -> tuple[Array, Triangles]:
-    """Return the hull of points, moved outwards to a grid until it has few triangles; see `hull_mesh`."""
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    out = hull_mesh(points)
-    for cell in _GRIDS:
-        if len(out[1]) <= _HULL_FACES:
-            break
-        away = points - middle
-        moved = middle + np.sign(away) * np.ceil(np.abs(away) / cell) * cell
-        out = hull_mesh(np.unique(moved.round(6), axis=0))
-    return out
-
-
 def _alike(file: Path, vertices: Array) -> bool:
     """Whether there is such a mesh file, of the extents of these vertices (n, 3)."""
     if not file.is_file():
@@ -145,6 +132,14 @@ def _alike(file: Path, vertices: Array) -> bool:
     there, _ = read_mesh(file, np.ones(3))
     extents = np.array([vertices.min(axis=0), vertices.max(axis=0)])
     return bool(np.abs(extents - [there.min(axis=0), there.max(axis=0)]).max() < _ALIKE)
+
+
+def is_binary_stl(path: Path) -> bool:
+    """Whether a file is STL in binary form, as long as its number of triangles says, which MuJoCo reads."""
+    with path.open("rb") as file:
+        head = file.read(84)
+    count = int.from_bytes(head[80:], "little")
+    return path.suffix.lower() == ".stl" and 0 < count <= MOST and path.stat().st_size == 84 + count * _FACET.itemsize
 
 
 def write_stl(path: Path, vertices: Array, triangles: Triangles) -> None:
@@ -181,6 +176,9 @@ def simplified(vertices: Array, triangles: Triangles, budget: int) -> tuple[Arra
         faces = same.reshape(-1)[triangles].astype(np.int32)
         a, b, c = faces.T
         faces = faces[(a != b) & (b != c) & (c != a)]
+        if len(faces) <= budget:  # corners that are one now have left no more
+            found = points, faces
+            break
         found = fast_simplification.simplify(points.astype(np.float32), faces, target_count=budget, agg=strength)
         if len(found[1]) <= _ENOUGH * budget:
             break

@@ -24,7 +24,7 @@ from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.lift import LiftParts
-from openarm_common.robot.xml_text import floats
+from openarm_common.robot.xml_text import child, floats
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
 from openarm_sim_bridge.world.appearance import vary
@@ -154,7 +154,7 @@ def robot_spec(
         OpenArmError: CONFIG_INVALID, when MuJoCo does not read the URDF.
     """
     hardware = hardware or drawn(IDEAL, description)
-    spec = _import_urdf(description)
+    spec = import_urdf(description)
     set_options(spec, physics)
     for side in description.arm_names:
         _actuate_arm(spec, description, side, hardware)
@@ -173,12 +173,18 @@ def robot_spec(
     return spec
 
 
-def _import_urdf(description: RobotDescription) -> mujoco.MjSpec:
+def import_urdf(description: RobotDescription) -> mujoco.MjSpec:
+    """Make the model of the robot alone, without actuators.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when MuJoCo does not read the URDF.
+    """
     root = ET.fromstring(description.urdf)
     assets = _take_files(root)
     # By default the importer merges links that are fixed to each other, with their names, and drops visual geometry.
-    extension = ET.SubElement(root, "mujoco")
-    ET.SubElement(extension, "compiler", fusestatic="false", discardvisual="false")
+    compiler = child(child(root, "mujoco"), "compiler")
+    compiler.attrib.pop("meshdir", None)  # meshes have other names here
+    compiler.attrib |= {"fusestatic": "false", "discardvisual": "false"}
     try:
         spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"), assets=assets)
     except ValueError as error:

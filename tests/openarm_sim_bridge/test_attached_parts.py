@@ -18,9 +18,10 @@ from openarm_motion.config import LimitsConfig, MotionConfig
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.moves import RequestBoxes, to_joints
 from openarm_sim_bridge.drafting.check import folder_faults
+from openarm_sim_bridge.drafting.collisions import coarse_hull
 from openarm_sim_bridge.drafting.draft import draft_folder
 from openarm_sim_bridge.drafting.edits import Edits
-from openarm_sim_bridge.drafting.mesh_files import coarse_hull, write_stl
+from openarm_sim_bridge.drafting.mesh_files import write_stl
 from openarm_sim_bridge.drafting.mjcf import compiled
 
 ARM = """<mujoco><compiler angle="radian"/><asset><mesh file="part.stl"/></asset><worldbody>

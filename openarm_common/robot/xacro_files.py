@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The text of a robot description's file, of xacro expanded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from xml.parsers.expat import ExpatError
+
+import xacro
+from xacro import substitution_args
+
+from openarm_common.config import read_text
+from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.robot.meshes import package_advice, package_folders
+
+
+class _Arguments(dict[str, str]):
+    """Arguments of a xacro file, and which of them it asks for."""
+
+    def __init__(self, given: Mapping[str, str]) -> None:
+        super().__init__(given)
+        self.asked: set[str] = set()
+
+    def __contains__(self, key: object) -> bool:
+        self.asked.add(str(key))
+        return super().__contains__(key)
+
+    def __getitem__(self, key: str) -> str:
+        self.asked.add(key)
+        return super().__getitem__(key)
+
+
+def description_text(
+    source: Path, arguments: Mapping[str, str] | None = None, packages: Mapping[str, Path] | None = None
+) -> str:
+    """Read a URDF; what is named `.xacro` is expanded.
+
+    Args:
+        source: File of the description.
+        arguments: Arguments of xacro by name.
+        packages: Folders of packages that `$(find NAME)` names; see `package_folders`.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, with what xacro says; INVALID_ARGUMENT, for an argument that the file does not
+            have.
+    """
+    given = _Arguments(arguments or {})
+    wanted = set(given)
+    text = _expanded(source, given, packages or {}) if source.suffix == ".xacro" else read_text(source)
+    if unknown := wanted - given.asked:
+        there = ", ".join(sorted(given.asked)) or "none"
+        text = f"{source} has no argument {', '.join(sorted(unknown))}; it has: {there}"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
+    return text
+
+
+def _expanded(source: Path, arguments: _Arguments, packages: Mapping[str, Path]) -> str:
+    def find(package: str) -> str:
+        found = next((path for path in package_folders(package, source, packages) if os.path.isdir(path)), None)
+        if found is None:
+            raise xacro.XacroException(f"there is no package {package!r}: {package_advice(package)}")
+        return str(found.resolve())
+
+    # xacro itself finds packages of an ament index only
+    before = substitution_args._eval_find
+    substitution_args._eval_find = substitution_args._eval_dict["find"] = find
+    try:
+        return xacro.process_file(str(source), mappings=arguments).toxml()
+    except (xacro.XacroException, ExpatError, OSError, RecursionError, UnicodeError) as error:
+        text = f"xacro does not expand {source}: {said(error, 600)}"
+        if isinstance(getattr(error, "exc", None), substitution_args.ArgException):
+            text += "; give it by --arg NAME:=VALUE of `openarm model new`"
+        raise OpenArmError(Code.CONFIG_INVALID, text) from error
+    finally:
+        substitution_args._eval_find = substitution_args._eval_dict["find"] = before

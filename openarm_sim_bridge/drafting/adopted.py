@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The URDF of a draft from its maker's URDF or xacro, with all meshes that it names in one folder. m, rad."""
+
+from __future__ import annotations
+
+import copy
+import shutil
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.convex import convex_parts
+from openarm_common.robot.meshes import is_convex, mesh_file, read_mesh
+from openarm_common.robot.xacro_files import description_text
+from openarm_common.robot.xml_text import attribute, child, floats, parse_root
+from openarm_sim_bridge.drafting.collisions import coarse_hull
+from openarm_sim_bridge.drafting.edits import Edits, matching
+from openarm_sim_bridge.drafting.mesh_files import MOST, is_binary_stl, simplified, write_stl
+
+_TAGS = ("visual", "collision")
+#: What edits can say of a URDF.
+_LIMITS = ("range", "velocity", "effort")
+#: Colour of what has a texture.
+_GREY = "0.5 0.5 0.5 1"
+
+
+class AdoptedUrdf:
+    """A maker's URDF that depends on no file out of its folder, with a name of its own for each shape.
+
+    Visual meshes become files that MuJoCo reads, collision meshes few convex hulls. A branch that is fixed to a link
+    which the file does not have is left out.
+
+    Args:
+        source: URDF, or xacro.
+        folder: Of the draft.
+        edits: Limits of joints.
+        arguments: Of xacro, by name.
+        packages: Folders of packages by name.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for edits and arguments that are none of this file; CONFIG_INVALID, when a file
+            is missing or faulty.
+    """
+
+    def __init__(
+        self, source: Path, folder: Path, edits: Edits, arguments: Mapping[str, str], packages: Mapping[str, Path]
+    ) -> None:
+        if other := sorted(edits.model_fields_set - set(_LIMITS)):
+            text = f"edits {', '.join(other)} are of an MJCF; those of a URDF are {', '.join(_LIMITS)}"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
+        self._source, self._folder, self._packages = source, folder, packages
+        self._copies: dict[tuple[Path, tuple[float, ...]], tuple[str, ...]] = {}
+        self._names: set[str] = set()
+        self._root = parse_root(description_text(source, arguments, packages), str(source))
+        #: What the draft leaves out, a sentence each.
+        self.remarks = _without_orphans(self._root)
+        for compiler in self._root.findall("mujoco/compiler"):
+            compiler.attrib.pop("meshdir", None)
+        for material in self._root.iter("material"):
+            for texture in material.findall("texture"):
+                material.remove(texture)
+                child(material, "color").attrib.setdefault("rgba", _GREY)
+        self._limit(edits)
+        for tag in _TAGS:
+            for link in self._root.findall("link"):
+                self._take_meshes(link, tag)
+        self._name_shapes()
+
+    def text(self) -> str:
+        """Return the URDF."""
+        ET.indent(self._root)
+        return ET.tostring(self._root, encoding="unicode") + "\n"
+
+    def _limit(self, edits: Edits) -> None:
+        for joint in self._root.findall("joint"):
+            if joint.get("type") not in ("revolute", "continuous", "prismatic"):
+                continue
+            name = joint.get("name", "")
+            span = matching(edits.range, name, None)
+            said = {key: matching(getattr(edits, key), name, None) for key in ("velocity", "effort")}
+            said |= {} if span is None or joint.get("type") == "continuous" else {"lower": span[0], "upper": span[1]}
+            values = {key: f"{value:.13g}" for key, value in said.items() if value is not None}
+            if values:
+                child(joint, "limit").attrib |= values
+
+    def _take_meshes(self, link: ET.Element, tag: str) -> None:
+        for shape in link.findall(tag):
+            mesh = shape.find("geometry/mesh")
+            if mesh is None:
+                continue
+            path = mesh_file(mesh.get("filename", ""), self._source, self._packages)
+            if tag == "visual":
+                mesh.set("filename", self._seen(path))
+                continue
+            scale = floats(mesh.get("scale", "1 1 1"), 3, mesh)
+            files = self._hulls(path, scale)
+            if (path, ()) in self._copies and files == self._copies[path, ()]:
+                mesh.set("filename", files[0])
+                continue
+            mesh.attrib.pop("scale", None)
+            for number, file in enumerate(files):
+                part = shape if number == 0 else copy.deepcopy(shape)
+                found = part.find("geometry/mesh")
+                assert found is not None  # it is a copy of what has one
+                found.set("filename", file)
+                if number:
+                    link.insert(list(link).index(shape) + number, part)
+
+    def _seen(self, path: Path) -> str:
+        """Take the file of a visual mesh as it is, or as STL; returns its name in the folder."""
+        if (path, ()) not in self._copies:
+            as_it_is = path.suffix.lower() == ".obj" or is_binary_stl(path)
+            file = self._file("visual", path.stem, path.suffix.lower() if as_it_is else ".stl")
+            if as_it_is:
+                shutil.copyfile(path, self._folder / file)
+            else:
+                write_stl(self._folder / file, *simplified(*read_mesh(path, np.ones(3)), MOST))
+            self._copies[path, ()] = (file,)
+        return self._copies[path, ()][0]
+
+    def _hulls(self, path: Path, scale: tuple[float, ...]) -> tuple[str, ...]:
+        """Take a collision mesh, m: the file that is seen where it is convex, or the files of its hulls."""
+        if (path, scale) not in self._copies:
+            vertices, triangles = read_mesh(path, np.array(scale))
+            convex = is_convex(vertices, triangles)
+            if convex and (path, ()) in self._copies:
+                files = list(self._copies[path, ()])
+            else:
+                parts = [np.unique(vertices, axis=0)] if convex else convex_parts(vertices, triangles)
+                stems = [path.stem if len(parts) == 1 else f"{path.stem}_{k}" for k in range(len(parts))]
+                files = [self._file("collision", stem, ".stl") for stem in stems]
+                for file, corners in zip(files, parts, strict=True):
+                    write_stl(self._folder / file, *coarse_hull(corners))
+            self._copies[path, scale] = tuple(files)
+        return self._copies[path, scale]
+
+    def _file(self, tag: str, stem: str, suffix: str) -> str:
+        """Return a name that no other mesh has."""
+        names = (stem if not k else f"{stem}_{k}" for k in range(len(self._names) + 1))
+        name = next(name for name in names if f"{tag}/{name}".lower() not in self._names)
+        self._names.add(f"{tag}/{name}".lower())
+        path = self._folder / "meshes" / tag / f"{name}{suffix}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return str(path.relative_to(self._folder))
+
+    def _name_shapes(self) -> None:
+        seen: set[str] = set()
+        for link in self._root.findall("link"):
+            for tag in _TAGS:
+                for piece, shape in enumerate(link.findall(tag)):
+                    name = shape.get("name") or f"{link.get('name')}_{piece:02d}_{tag}"
+                    shape.set("name", name if name not in seen else f"{name}_{len(seen)}")
+                    seen.add(shape.get("name", ""))
+
+
+def _without_orphans(root: ET.Element) -> tuple[str, ...]:
+    """Take out branches that are fixed to a link which is not there; returns a sentence for each."""
+    remarks: list[str] = []
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    for joint in root.findall("joint"):
+        parent = _link(joint, "parent")
+        if joint.get("type") != "fixed" or parent in links:
+            continue
+        branch, joints = [_link(joint, "child")], [joint]
+        for link in branch:
+            below = [other for other in root.findall("joint") if _link(other, "parent") == link and other not in joints]
+            joints += below
+            branch += [_link(other, "child") for other in below]
+        for element in [*joints, *(links[link] for link in branch if link in links)]:
+            root.remove(element)
+        what = f"joint {joint.get('name')!r} fixes it to {parent!r}, which the file does not have"
+        remarks.append(f"left out {', '.join(branch)}: {what}")
+    return tuple(remarks)
+
+
+def _link(joint: ET.Element, role: str) -> str:
+    element = joint.find(role)
+    return "" if element is None else attribute(element, "link")
