@@ -43,7 +43,8 @@ def mesh_file(name: str, urdf: Path, packages: Mapping[str, Path] | None = None)
     if not name.startswith(_PACKAGE):
         path = urdf.parent / name.removeprefix(_FILE)
         if not is_file(path):
-            raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: there is no mesh {path}")
+            way = "name it from the folder of this file, or by package://NAME/PATH"
+            raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: there is no mesh {path}; {way}")
         return path
     package, _, rest = name.removeprefix(_PACKAGE).partition("/")
     tried = [folder / rest for folder in package_folders(package, urdf, packages or {})]

@@ -60,7 +60,8 @@ def _expanded(source: Path, arguments: _Arguments, packages: Mapping[str, Path])
     def find(package: str) -> str:
         found = next((path for path in package_folders(package, source, packages) if os.path.isdir(path)), None)
         if found is None:
-            raise xacro.XacroException(f"there is no package {package!r}: {package_advice(package)}")
+            text = f"there is no package {package[:80]!r}, which {source} names; {package_advice(package[:80])}"
+            raise OpenArmError(Code.CONFIG_INVALID, text)
         return str(found.resolve())
 
     # xacro itself finds packages of an ament index only
@@ -69,9 +70,18 @@ def _expanded(source: Path, arguments: _Arguments, packages: Mapping[str, Path])
     try:
         return xacro.process_file(str(source), mappings=arguments).toxml()
     except (xacro.XacroException, ExpatError, OSError, RecursionError, UnicodeError) as error:
+        cause = _cause(error)
+        if isinstance(cause, OpenArmError):
+            raise cause from error
         text = f"xacro does not expand {source}: {said(error, 600)}"
-        if isinstance(getattr(error, "exc", None), substitution_args.ArgException):
+        if isinstance(cause, substitution_args.ArgException):
             text += "; give it by --arg NAME:=VALUE of `openarm model new`"
         raise OpenArmError(Code.CONFIG_INVALID, text) from error
     finally:
         substitution_args._eval_find = substitution_args._eval_dict["find"] = before
+
+
+def _cause(error: BaseException) -> BaseException:
+    """Return what xacro has wrapped, once or more."""
+    inner = getattr(error, "exc", None)
+    return _cause(inner) if isinstance(inner, BaseException) else error

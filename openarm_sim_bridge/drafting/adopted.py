@@ -20,6 +20,7 @@ from openarm_sim_bridge.drafting.collisions import coarse_hull
 from openarm_sim_bridge.drafting.edits import Edits, matching
 from openarm_sim_bridge.drafting.mesh_files import MOST, is_binary_stl, simplified, write_stl
 
+_PARTS = ("link", "joint", "material", "mujoco")
 _TAGS = ("visual", "collision")
 #: What edits can say of a URDF.
 _LIMITS = ("range", "velocity", "effort")
@@ -30,8 +31,8 @@ _GREY = "0.5 0.5 0.5 1"
 class AdoptedUrdf:
     """A maker's URDF that depends on no file out of its folder, with a name of its own for each shape.
 
-    Visual meshes become files that MuJoCo reads, collision meshes few convex hulls. A branch that is fixed to a link
-    which the file does not have is left out.
+    Visual meshes become files that MuJoCo reads, collision meshes few convex hulls. Textures are left out, and what is
+    of other programs, such as `ros2_control`; so is a branch that is fixed to a link which the file does not have.
 
     Args:
         source: URDF, or xacro.
@@ -55,7 +56,10 @@ class AdoptedUrdf:
         self._copies: dict[tuple[Path, tuple[float, ...]], tuple[str, ...]] = {}
         self._names: set[str] = set()
         self._root = parse_root(description_text(source, arguments, packages), str(source))
-        #: What the draft leaves out, a sentence each.
+        for element in list(self._root):
+            if element.tag not in _PARTS:
+                self._root.remove(element)
+        #: Branches that are left out, a sentence each.
         self.remarks = _without_orphans(self._root)
         for compiler in self._root.findall("mujoco/compiler"):
             compiler.attrib.pop("meshdir", None)
@@ -83,8 +87,10 @@ class AdoptedUrdf:
             said = {key: matching(getattr(edits, key), name, None) for key in ("velocity", "effort")}
             said |= {} if span is None or joint.get("type") == "continuous" else {"lower": span[0], "upper": span[1]}
             values = {key: f"{value:.13g}" for key, value in said.items() if value is not None}
-            if values:
-                child(joint, "limit").attrib |= values
+            if values or joint.find("limit") is not None:
+                # urdfdom reads no joint without the limits of effort and velocity; 0: not known
+                limit = child(joint, "limit")
+                limit.attrib = {"effort": "0", "velocity": "0"} | limit.attrib | values
 
     def _take_meshes(self, link: ET.Element, tag: str) -> None:
         for shape in link.findall(tag):

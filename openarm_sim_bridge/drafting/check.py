@@ -37,8 +37,8 @@ def folder_faults(folder: Path) -> list[str]:
     faults = [*_mesh_faults(robot, urdf), *_limit_faults(robot), *_pad_faults(parts, robot), *_group_faults(robot)]
     try:
         contacts = LinkContacts(robot)
-    except ValueError as error:
-        return [*faults, f"pinocchio does not read the URDF: {said(error)}", *_mujoco_faults(robot, urdf)]
+    except OpenArmError as error:
+        return [*faults, error.message, *_mujoco_faults(robot, urdf)]
     always = sorted(map(sorted, contacts.always_touching() - robot.allowed_collisions))
     return [
         *faults,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import ConvexHull
 
+from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.robot.description import Joint, Primitive, RobotDescription
 from openarm_common.types import Array
 
@@ -30,10 +31,16 @@ class LinkContacts:
     Args:
         description: The robot; collision meshes are hulls, see `RobotDescription.from_files`.
         margin: Links that are nearer to each other touch, m.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when pinocchio does not read the URDF.
     """
 
     def __init__(self, description: RobotDescription, margin: float = 0.0) -> None:
-        self._model = pin.buildModelFromXML(description.urdf)
+        try:
+            self._model = pin.buildModelFromXML(description.urdf)
+        except ValueError as error:
+            raise OpenArmError(Code.CONFIG_INVALID, f"pinocchio does not read the URDF: {said(error)}") from error
         self._geometry, owner = pin.GeometryModel(), list[str]()
         for link in description.links.values():
             frame = self._model.frames[self._model.getFrameId(link.name, pin.FrameType.BODY)]

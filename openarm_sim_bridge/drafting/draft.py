@@ -22,6 +22,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Joint, RobotDescription
 from openarm_common.types import Array
 from openarm_sim_bridge.drafting.adopted import AdoptedUrdf
+from openarm_sim_bridge.drafting.collisions import LinkContacts, adjacent_pairs
 from openarm_sim_bridge.drafting.edits import Edits
 from openarm_sim_bridge.drafting.mjcf import UrdfDraft, compiled
 from openarm_sim_bridge.drafting.semantics import SOURCE, write_srdf
@@ -173,7 +174,8 @@ def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> tuple[
     remarks: list[str] = []
     if leader is not None and others:
         what = f"arms.{name}: finger_joint {leader.name!r} is a guess; further joints of the hand: {', '.join(others)}"
-        remarks.append(f"{what}; change finger_joint and fingers in robot.yaml where another one drives the hand")
+        way = "couple to it what follows it, by <mimic> of a URDF, or mimic and fixed of edits of an MJCF"
+        remarks.append(f"{what}; where another one drives the hand, change robot.yaml; {way}")
     elif others:
         what = f"arms.{name}: no joint of the hand has limits, so it has no fingers: {', '.join(others)}"
         remarks.append(f"{what}; give one limits, then draft again")
@@ -193,9 +195,22 @@ def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> tuple[
 
 
 def _ends(robot: RobotDescription, links: list[str]) -> list[str]:
-    """Links that most of the others carry: the fingers of a linkage, not what moves them."""
+    """Links that most of the others carry: the fingers of a linkage, not what moves them; of each, what has its pad."""
     carried = {link: len(_links_to(robot, link) & set(links)) for link in links}
-    return [link for link in links if carried[link] == max(carried.values())]
+    ends = [link for link in links if carried[link] == max(carried.values())]
+    return [next((link for link in _fixed_to(robot, end) if _has_pad(robot, link)), end) for end in ends]
+
+
+def _fixed_to(robot: RobotDescription, link: str) -> list[str]:
+    """Links that are fixed to one, directly or by others."""
+    found = [link]
+    for name in found:
+        found += [joint.child for joint in robot.joints.values() if joint.type == "fixed" and joint.parent == name]
+    return found
+
+
+def _has_pad(robot: RobotDescription, link: str) -> bool:
+    return any(shape.name == f"{link}_pad_collision" for shape in robot.links[link].collision)
 
 
 def mirror_signs(robot: RobotDescription, arms: list[list[str]]) -> list[int]:
@@ -235,21 +250,31 @@ def _links_to(robot: RobotDescription, link: str) -> set[str]:
 
 
 def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Postures to begin with: all joints as near to 0 as their limits let them, the fingers at both ends."""
+    """Postures to begin with: all joints as near to 0 as their limits let them, the fingers at both ends.
+
+    Links of one hand may touch that do so there, such as those of a linkage, whose hulls overlap.
+    """
     zero = {
         name: [float(np.clip(0.0, robot.joints[j].lower, robot.joints[j].upper)) for j in arm["joints"]]
         for name, arm in parts.items()
     }
     ends: dict[str, dict[str, float]] = {"open": {}, "closed": {}}
+    touching: set[tuple[str, ...]] = set()
+    contacts = LinkContacts(robot)
     for name, arm in parts.items():
+        touching |= {tuple(sorted(pair)) for pair in itertools.pairwise(arm["fingers"])}
         if arm["finger_joint"]:
             joint = robot.joints[arm["finger_joint"]]
             ends["closed"][name], ends["open"][name] = sorted(
                 (joint.lower, joint.upper), key=lambda q: (round(_gap(robot, arm, q), 6), abs(q))
             )
-    touching = [list(arm["fingers"][k : k + 2]) for arm in parts.values() for k in range(len(arm["fingers"]) - 1)]
+            hand = {link for link in robot.links if arm["hand"] in {robot.root, *_links_to(robot, link)}}
+            for end in (joint.lower, joint.upper, float(np.clip(0.0, joint.lower, joint.upper))):
+                found = contacts.at({joint.name: end}) - adjacent_pairs(robot)
+                touching |= {tuple(sorted(pair)) for pair in found if pair <= hand}
     gripper = ends if any(ends.values()) else {}
-    return {"postures": {"home": zero, "zero": zero}, "gripper": gripper, "may_touch": touching}
+    pairs = [list(pair) for pair in sorted(touching)]
+    return {"postures": {"home": zero, "zero": zero}, "gripper": gripper, "may_touch": pairs}
 
 
 def _gap(robot: RobotDescription, arm: Mapping[str, Any], position: float) -> float:

@@ -87,11 +87,7 @@ def test_a_hand_of_its_own_is_attached_and_all_stands_where_the_edits_say(parts:
             np.testing.assert_allclose(T[:3, :3], data.body(link).xmat.reshape(3, 3), atol=1e-9)
     np.testing.assert_allclose(robot.link_pose("my_base", {})[:3, 3], (0.1, 0.0, 0.4), atol=1e-9)
     arm = yaml.safe_load((folder / "robot.yaml").read_text())["arms"]["mine"]
-    assert (arm["joints"], arm["finger_joint"], arm["fingers"]) == (
-        ["my_lift"],
-        "grip_drive",
-        ["grip_drive", "grip_tip"],
-    )
+    assert (arm["joints"], arm["finger_joint"], arm["fingers"]) == (["my_lift"], "grip_drive", ["grip_tip"])
 
 
 def test_joints_and_shapes_are_as_the_edits_say(parts: Path) -> None:
