@@ -15,6 +15,12 @@ from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.robot.meshes import package_advice, package_folders
 
+#: What xacro raises for faulty files: little of it is wrapped.
+_XACRO_RAISES = (
+    xacro.XacroException, ExpatError, OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError,
+    SyntaxError,
+)  # fmt: skip
+
 
 class _Arguments(dict[str, str]):
     """Arguments of a xacro file, and which of them it asks for."""
@@ -69,7 +75,7 @@ def _expanded(source: Path, arguments: _Arguments, packages: Mapping[str, Path])
     substitution_args._eval_find = substitution_args._eval_dict["find"] = find
     try:
         return xacro.process_file(str(source), mappings=arguments).toxml()
-    except (xacro.XacroException, ExpatError, OSError, RecursionError, UnicodeError) as error:
+    except _XACRO_RAISES as error:
         cause = _cause(error)
         if isinstance(cause, OpenArmError):
             raise cause from error

@@ -288,10 +288,9 @@ def push_ways(
 @cache
 def closed_hand(description: RobotDescription, arm: str) -> Array:
     """Points (n, 3) of the hand and its closed fingers, some mm apart, TCP frame, m."""
-    tcp = description.tcp_link(arm)
-    palm = description.chain(tcp)[-1].parent
-    links = [palm, *(joint.child for joint in description.joints.values() if joint.parent == palm)]
-    poses = description.link_poses(dict.fromkeys(description.joints, 0.0))
+    tcp, palm, hand = description.tcp_link(arm), description.arm(arm).hand, description.hand(arm)
+    links = [link for link in description.links if palm in {link, *(j.parent for j in description.chain(link))}]
+    poses = description.link_poses({**dict.fromkeys(description.joints, 0.0), hand.joint: hand.closed})
     T_tcp_base = se3.inverse(poses[tcp])
     found = [np.zeros((1, 3))]
     for link in links:

@@ -118,9 +118,8 @@ class AdoptedUrdf:
     def _seen(self, path: Path) -> str:
         """Take the file of a visual mesh as it is, or as STL; returns its name in the folder."""
         if (path, ()) not in self._copies:
-            as_it_is = path.suffix.lower() == ".obj" or is_binary_stl(path)
-            file = self._file("visual", path.stem, path.suffix.lower() if as_it_is else ".stl")
-            if as_it_is:
+            file = self._file("visual", path.stem)
+            if is_binary_stl(path):
                 shutil.copyfile(path, self._folder / file)
             else:
                 write_stl(self._folder / file, *simplified(*read_mesh(path, np.ones(3)), MOST))
@@ -137,18 +136,18 @@ class AdoptedUrdf:
             else:
                 parts = [np.unique(vertices, axis=0)] if convex else convex_parts(vertices, triangles)
                 stems = [path.stem if len(parts) == 1 else f"{path.stem}_{k}" for k in range(len(parts))]
-                files = [self._file("collision", stem, ".stl") for stem in stems]
+                files = [self._file("collision", stem) for stem in stems]
                 for file, corners in zip(files, parts, strict=True):
                     write_stl(self._folder / file, *coarse_hull(corners))
             self._copies[path, scale] = tuple(files)
         return self._copies[path, scale]
 
-    def _file(self, tag: str, stem: str, suffix: str) -> str:
+    def _file(self, tag: str, stem: str) -> str:
         """Return a name that no other mesh has."""
         names = (stem if not k else f"{stem}_{k}" for k in range(len(self._names) + 1))
         name = next(name for name in names if f"{tag}/{name}".lower() not in self._names)
         self._names.add(f"{tag}/{name}".lower())
-        path = self._folder / "meshes" / tag / f"{name}{suffix}"
+        path = self._folder / "meshes" / tag / f"{name}.stl"
         path.parent.mkdir(parents=True, exist_ok=True)
         return str(path.relative_to(self._folder))
 

@@ -168,3 +168,11 @@ def test_what_lies_over_others_is_pushed_off_them_above_their_tops() -> None:
         for way in push_ways(sweep.met, sweep.end, CONFIG, hand(), HAND):
             assert way.T_base_tcp[2, 3] > low[0].top
     assert sweeps(heap, hand(), CONTEXT, lengths, level=0.15) == ()  # the hand would go over it
+
+
+@pytest.mark.requirement("N-13")
+def test_a_closed_hand_is_all_of_its_linkage_where_the_pads_meet() -> None:
+    points = closed_hand(RobotDescription.load("ur5e"), "ur5e")
+    front = points[points[:, 2] > 0.0]
+    assert front[:, 2].max() == pytest.approx(0.0176, abs=1e-3)  # pads go forward as they close
+    assert np.abs(front[:, 1]).max() < 0.04  # those of the open hand are beyond

@@ -207,8 +207,8 @@ def test_a_draft_says_what_is_left_to_do(folder):
     assert len(pads) == 3  # that of one finger is in the edits
     (effort,) = (f for f in faults if "effort" in f)
     assert effort == (
-        "joints without a limit of effort > 0: left_slide (0), right_hinge (0), right_slide (0), right_g1 (0); give it for"
-        ' all of them in <limit> of the URDF, or by `effort: {"*": NUMBER}` in --edits of a new draft'
+        "joints without a limit of effort > 0: left_slide (0), right_hinge (0), right_slide (0), right_g1 (0); give it"
+        ' for all of them in <limit> of the URDF, or by `effort: {"*": NUMBER}` in --edits of a new draft'
     )
     assert len(faults) == 4
 

@@ -1,0 +1,368 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drafts of robots from URDF and xacro: packages, meshes, limits, fingers; and what keeps none from being made."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial import ConvexHull
+
+from openarm_bringup.commands.model import new
+from openarm_common.errors import Code
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.folder import load_folder, robot_names
+from openarm_common.robot.meshes import is_convex, read_mesh
+from openarm_common.robot.urdf import Primitive
+from openarm_sim_bridge.drafting.check import folder_faults
+from openarm_sim_bridge.drafting.collisions import coal_shape
+from openarm_sim_bridge.drafting.draft import Draft, draft_folder, mirror_signs
+from openarm_sim_bridge.drafting.mesh_files import simplified, write_stl
+from openarm_sim_bridge.world.model import import_urdf
+from tests.refusals import refused
+
+ARM = {"arm": ("base", "tip")}
+TETRAHEDRON = np.array([(0, 0, 0), (0.03, 0, 0), (0, 0.02, 0), (0, 0, 0.1)], np.float64)
+FACES = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+#: Two of them, far from each other.
+PAIR = np.concatenate([TETRAHEDRON, np.add(TETRAHEDRON, (0.0, 0.0, 0.5))])
+PAIR_FACES = np.concatenate([FACES, FACES + 4])
+INERTIA = '<inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">{points}</float_array><technique_common>
+<accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/><p>{faces}</p></triangles></mesh></geometry>
+</library_geometries><library_visual_scenes><visual_scene id="s"><node><instance_geometry url="#g"/></node>
+</visual_scene></library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+def mesh(name: str, scale: str = "1 1 1") -> str:
+    """Shapes of a link, seen and touched."""
+    shape = f'<geometry><mesh filename="{name}" scale="{scale}"/></geometry>'
+    return f"<visual>{shape}</visual><collision>{shape}</collision>"
+
+
+def link(name: str, shapes: str = "") -> str:
+    return f'<link name="{name}">{INERTIA}{shapes}</link>'
+
+
+def joint(name: str, kind: str, parent: str, child: str, more: str = "", span: str = 'lower="-1" upper="1"') -> str:
+    limit = "" if kind == "fixed" else f'<axis xyz="0 1 0"/><limit {span} effort="5" velocity="2"/>'
+    ends = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="0 0 0.2"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{limit}{more}</joint>'
+
+
+def robot(shapes: str = "", more: str = "") -> str:
+    """An arm of one joint, with shapes on the link that moves."""
+    parts = link("base") + link("upper", shapes) + '<link name="tip"/>'
+    joints = joint("shoulder", "revolute", "base", "upper") + joint("tip_fixed", "fixed", "upper", "tip")
+    return f'<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">{parts}{joints}{more}</robot>'
+
+
+def drafted(at: Path, text: str, name: str = "r.urdf", **more: object) -> tuple[Path, Draft]:
+    """Draft a robot from a text; its folder, which holds, and what is said of it."""
+    source = at / name
+    source.parent.mkdir(parents=True, exist_ok=True)
+    source.write_text(text, encoding="utf-8")
+    folder = at / "robots" / "mine"
+    return folder, draft_folder(folder, source, ARM, samples=10, **more)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.requirement("B-07")
+def test_a_package_is_found_above_the_file_and_the_draft_needs_it_no_longer(tmp_path):
+    package = tmp_path / "workspace" / "checkout-1.2"
+    package.mkdir(parents=True)
+    (package / "package.xml").write_text("<package><name> parts </name></package>")
+    for folder in (package, package.parent / "others"):
+        (folder / "meshes").mkdir(parents=True)
+        write_stl(folder / "meshes" / "m.stl", TETRAHEDRON, FACES)
+    shapes = mesh("package://parts/meshes/m.stl") + mesh("package://others/meshes/m.stl", "2 1 1")
+    folder, draft = drafted(package / "urdf" / "deep", robot(shapes))
+    elsewhere = shutil.copytree(folder, tmp_path / "mine")
+    shutil.rmtree(package.parent)
+    assert sorted(path.name for path in elsewhere.glob("meshes/*/*")) == ["m.stl", "m_1.stl"]
+    upper = RobotDescription.from_files(elsewhere / "mine.urdf").links["upper"]
+    np.testing.assert_allclose([shape.size for shape in upper.collision], [(0.03, 0.02, 0.1), (0.06, 0.02, 0.1)])
+    assert folder_faults(elsewhere) == []
+    assert draft.remarks == ()
+
+
+def test_a_package_is_where_an_option_or_the_environment_says(tmp_path, monkeypatch):
+    (tmp_path / "far" / "parts").mkdir(parents=True)
+    write_stl(tmp_path / "far" / "parts" / "m.stl", TETRAHEDRON, FACES)
+    text, at = robot(mesh("package://parts/m.stl")), tmp_path / "near"
+    error = refused("there is no mesh 'package://parts/m.stl'; tried ", drafted, at, text)
+    assert error.message.endswith("--package parts=FOLDER of `openarm model new`, or its parent in ROS_PACKAGE_PATH")
+    drafted(at, text, packages={"parts": tmp_path / "far" / "parts"})
+    for place in (tmp_path / "far", tmp_path / "far" / "parts"):
+        monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path / 'none'}:{place}")
+        shutil.rmtree(at / "robots")
+        drafted(at, text)
+
+
+XACRO = (
+    robot()
+    .replace("<link", '<xacro:arg name="long" default="1"/><link', 1)
+    .replace('xyz="0 0 0.2"', 'xyz="0 0 $(arg long)"', 1)
+    .replace('name="r"', 'name="$(arg who)"', 1)
+)
+
+
+@pytest.mark.requirement("B-07")
+def test_a_xacro_is_expanded_with_the_arguments_and_packages_given(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "more.xacro").write_text(
+        "<robot>" + link("more") + joint("m", "fixed", "base", "more") + "</robot>"
+    )
+    text = XACRO.replace("</robot>", '<xacro:include filename="$(find parts)/more.xacro"/></robot>')
+    where = (
+        f"there is no package 'parts', which {tmp_path}/r.urdf.xacro names; name its folder by --package parts=FOLDER"
+    )
+    assert refused(None, drafted, tmp_path, text, "r.urdf.xacro", arguments={"who": "me"}).message.startswith(where)
+    packages = {"parts": tmp_path / "far"}
+    folder, _ = drafted(tmp_path, text, "r.urdf.xacro", packages=packages, arguments={"who": "me", "long": "0.7"})
+    mine = RobotDescription.from_files(folder / "mine.urdf")
+    assert mine.joints["shoulder"].T_parent_joint[2, 3] == 0.7
+    assert "more" in mine.links
+
+
+@pytest.mark.parametrize(
+    ("more", "arguments", "words"),
+    [
+        ("", {}, r"Undefined substitution argument who; give it by --arg NAME:=VALUE"),
+        ("", {"who": "me", "lnog": "1"}, "has no argument lnog; it has: long, who"),
+        ("<xacro:arg/>", {"who": "me"}, "xacro does not expand .*missing attribute"),
+        ("<xacro:nothing/>", {"who": "me"}, "xacro does not expand .*unknown macro name: xacro:nothing"),
+        ('<link name="${1/0}"/>', {"who": "me"}, "xacro does not expand .*division by zero"),
+        ("<link>", {"who": "me"}, "xacro does not expand .*mismatched tag"),
+        ('<xacro:include filename="r.xacro"/>', {"who": "me"}, "xacro does not expand .*recursion"),
+    ],
+)
+def test_what_xacro_lacks_is_said(tmp_path, more, arguments, words):
+    text = XACRO.replace("</robot>", f"{more}</robot>")
+    refused(words, drafted, tmp_path, text, "r.xacro", arguments=arguments)
+
+
+def test_a_draft_that_fails_leaves_nothing_and_keeps_what_was_there(tmp_path):
+    mine = tmp_path / "robots" / "mine"
+    refused("there is no mesh", drafted, tmp_path, robot(mesh("m.stl")))
+    assert not list((tmp_path / "robots").iterdir())
+    mine.mkdir()
+    (mine / "semantics.yaml").write_text("postures: {up: {arm: [0.5]}}\nsamples: 5\n")
+    refused("there is no mesh", drafted, tmp_path, robot(mesh("m.stl")))
+    assert [path.name for path in mine.iterdir()] == ["semantics.yaml"]
+    folder, _ = drafted(tmp_path, robot())
+    assert '<group_state name="up" group="arm_arm">' in (folder / "mine.srdf").read_text()
+    assert [path.name for path in (tmp_path / "robots").iterdir()] == ["mine"]
+
+
+@pytest.mark.requirement("B-07")
+def test_a_convex_mesh_is_one_file_and_another_is_hulls_that_hold_it(tmp_path):
+    write_stl(tmp_path / "m.stl", TETRAHEDRON, FACES)
+    write_stl(tmp_path / "pair.stl", PAIR, PAIR_FACES)
+    folder, _ = drafted(tmp_path, robot(mesh("m.stl", "2 -1 1") + mesh("pair.stl", "1 1 -3")))
+    files = sorted(path.relative_to(folder / "meshes") for path in folder.glob("meshes/*/*"))
+    assert [file.name for file in files if file.parent.name == "visual"] == ["m.stl", "pair.stl"]
+    hulls = [folder / "meshes" / file for file in files if file.parent.name == "collision"]
+    assert len(hulls) > 1
+    meshes = [read_mesh(hull, np.ones(3)) for hull in hulls]
+    assert all(is_convex(*found) for found in meshes)
+    planes = [ConvexHull(vertices).equations for vertices, _ in meshes]
+    inside = [(PAIR * (1, 1, -3)) @ e[:, :3].T + e[:, 3] <= 1e-6 for e in planes]
+    assert np.any([rows.all(axis=1) for rows in inside], axis=0).all()
+    assert folder_faults(folder) == []
+
+
+def ascii_stl(path: Path) -> None:
+    facets = (
+        "facet normal 0 0 0\nouter loop\n" + "".join("vertex {} {} {}\n".format(*TETRAHEDRON[k]) for k in face)
+        + "endloop\nendfacet\n"
+        for face in FACES
+    )  # fmt: skip
+    path.write_text("solid a\n" + "".join(facets) + "endsolid a\n")
+
+
+def obj(path: Path) -> None:
+    lines = ["v {} {} {}".format(*point) for point in TETRAHEDRON]
+    path.write_text("\n".join([*lines, *("f {} {} {}".format(*(face + 1)) for face in FACES), ""]))
+
+
+def dae(path: Path) -> None:
+    numbers = {"points": " ".join(map(str, TETRAHEDRON.ravel())), "faces": " ".join(map(str, FACES.ravel()))}
+    path.write_text(DAE.format(**numbers))
+
+
+@pytest.mark.requirement("B-07")
+@pytest.mark.parametrize(("name", "write"), [("m.dae", dae), ("m.stl", ascii_stl), ("m.obj", obj)])
+def test_meshes_that_mujoco_does_not_read_become_stl(tmp_path, name, write):
+    write(tmp_path / name)
+    folder, _ = drafted(tmp_path, robot(mesh(name)))
+    (file,) = folder.glob("meshes/*/*")
+    assert file.name == "m.stl"
+    vertices, triangles = read_mesh(file, np.ones(3))
+    assert sorted(map(tuple, np.unique(vertices, axis=0).round(6))) == sorted(map(tuple, TETRAHEDRON))
+    assert len(triangles) == 4
+    assert folder_faults(folder) == []
+    model = import_urdf(RobotDescription.from_files(folder / "mine.urdf")).compile()
+    assert model.nmesh == 1
+
+
+def test_settings_of_mujoco_textures_and_parts_of_other_programs_are_no_hindrance(tmp_path):
+    write_stl(tmp_path / "m.stl", TETRAHEDRON, FACES)
+    more = (
+        '<mujoco><compiler meshdir="elsewhere" discardvisual="true" balanceinertia="true"/></mujoco>'
+        '<material name="skin"><texture filename="package://nobody/skin.png"/></material>'
+        '<ros2_control name="c" type="system"><param name="file">/home/maker/c.yaml</param></ros2_control>'
+    )
+    folder, _ = drafted(tmp_path, robot(mesh("m.stl").replace("</visual>", '<material name="skin"/></visual>'), more))
+    text = (folder / "mine.urdf").read_text()
+    assert "balanceinertia" in text
+    assert not any(word in text for word in ("elsewhere", "skin.png", "/home/maker"))
+    assert folder_faults(folder) == []
+
+
+def test_a_branch_that_is_fixed_to_nothing_is_left_out_and_one_that_moves_is_refused(tmp_path):
+    branch = link("logo") + link("screw") + joint("s", "{}", "logo", "screw") + joint("l", "fixed", "head", "logo")
+    folder, draft = drafted(tmp_path, robot(more=branch.format("fixed")))
+    assert draft.remarks == ("left out logo, screw: joint 'l' fixes it to 'head', which the file does not have",)
+    assert list(RobotDescription.from_files(folder / "mine.urdf").links) == ["base", "upper", "tip"]
+    moving = link("head") + joint("h", "revolute", "neck", "head")
+    refused("joint 'h' has the parent link 'neck', which does not exist", drafted, tmp_path / "2", robot(more=moving))
+
+
+def test_limits_that_a_urdf_lacks_are_given_for_all_joints_at_once(tmp_path):
+    text = robot(more=link("end") + joint("wrist", "continuous", "tip", "end"))
+    text = text.replace('effort="5" velocity="2"', 'effort="0"', 1).replace('effort="5" velocity="2"', "")
+    (velocity, effort) = folder_faults(drafted(tmp_path, text)[0])
+    assert velocity.startswith(
+        "joints without a limit of velocity > 0: shoulder (0), wrist (0); give it for all of them"
+    )
+    assert effort.startswith("joints without a limit of effort > 0: shoulder (0), wrist (0); give it for all of them")
+    edits = tmp_path / "edits.yaml"
+    edits.write_text('velocity: {"*": 1.5}\neffort: {shoulder: 7, "*": 3}\nrange: {"s*": [-0.5, 0.25]}\n')
+    folder, _ = drafted(tmp_path / "again", text, edits=edits)
+    assert folder_faults(folder) == []
+    found = RobotDescription.from_files(folder / "mine.urdf").joints["shoulder"]
+    assert (found.lower, found.upper, found.velocity, found.effort) == (-0.5, 0.25, 1.5, 7.0)
+    edits.write_text("prefix: my_\n")
+    error = refused(
+        "edits prefix are of an MJCF; those of a URDF are range", drafted, tmp_path / "3", text, edits=edits
+    )
+    assert error.code is Code.INVALID_ARGUMENT
+
+
+def hand(tmp_path: Path, more: str) -> tuple[dict[str, object], dict[str, object], tuple[str, ...]]:
+    """What a draft says of the hand on the upper link: arm and gripper, and remarks."""
+    folder, draft = drafted(tmp_path, robot(more=more))
+    arm = yaml.safe_load((folder / "robot.yaml").read_text())["arms"]["arm"]
+    text = (folder / "semantics.yaml").read_text()
+    assert "inf" not in text
+    return arm, yaml.safe_load(text)["gripper"], draft.remarks
+
+
+def pads(*names: str) -> str:
+    box = '<collision name="{}_pad_collision"><geometry><box size="0.01 0.01 0.01"/></geometry></collision>'
+    return "".join(link(name, box.format(name)) for name in names)
+
+
+@pytest.mark.requirement("B-07")
+def test_fingers_are_what_slides_together_and_not_a_propeller_before_them(tmp_path):
+    slides = joint("left", "prismatic", "upper", "l", span='lower="0.02" upper="0.05"') + joint(
+        "right", "prismatic", "upper", "r", '<mimic joint="left" multiplier="-1"/>', 'lower="-0.05" upper="-0.02"'
+    )
+    more = link("propeller") + joint("motor", "continuous", "upper", "propeller") + pads("l", "r") + slides
+    arm, gripper, remarks = hand(tmp_path, more)
+    assert (arm["finger_joint"], arm["fingers"]) == ("left", ["l", "r"])
+    assert gripper == {"open": {"arm": 0.05}, "closed": {"arm": 0.02}}
+    (remark,) = remarks
+    assert remark.startswith("arms.arm: finger_joint 'left' is a guess; further joints of the hand: motor; ")
+
+
+def test_of_a_linkage_the_fingers_are_its_ends_and_closed_is_where_they_meet(tmp_path):
+    def side(name: str, x: float, sign: int) -> str:
+        def bar(end: str, parent: str, turn: int) -> str:
+            follows = f'<mimic joint="l_bar" multiplier="{turn}"/>' if f"{name}_{end}" != "l_bar" else ""
+            return link(f"{name}_{end}") + joint(
+                f"{name}_{end}", "revolute", parent, f"{name}_{end}", follows, 'lower="0" upper="0.2"'
+            )
+
+        bars = bar("bar", "upper", sign).replace('"0 0 0.2"', f'"{x} 0 0"') + bar("inner", "upper", sign)
+        fixed = joint(f"{name}_fixed", "fixed", f"{name}_tip", f"{name}_pad")
+        return bars + bar("tip", f"{name}_bar", -sign) + pads(f"{name}_pad") + fixed
+
+    arm, gripper, remarks = hand(tmp_path, side("l", -0.05, 1) + side("r", 0.05, -1))
+    assert (arm["finger_joint"], arm["fingers"]) == ("l_bar", ["l_pad", "r_pad"])
+    assert gripper == {"open": {"arm": 0.0}, "closed": {"arm": 0.2}}
+    assert remarks == ()
+
+
+def test_one_jaw_and_a_hand_of_many_joints_are_said(tmp_path):
+    arm, _, remarks = hand(tmp_path / "1", pads("jaw") + joint("grip", "revolute", "upper", "jaw"))
+    assert (arm["finger_joint"], arm["fingers"]) == ("grip", ["jaw"])
+    (remark,) = remarks
+    assert remark.startswith("arms.arm: 'grip' moves one finger, 'jaw'; where the other is a part of 'upper', add that")
+    many = "".join(link(f"f{k}") + joint(f"j{k}", "revolute", "upper", f"f{k}") for k in range(4))
+    arm, _, remarks = hand(tmp_path / "2", many)
+    assert arm["finger_joint"] == "j0"
+    assert remarks[0].startswith("arms.arm: finger_joint 'j0' is a guess; further joints of the hand: j1, j2, j3; ")
+    arm, gripper, remarks = hand(tmp_path / "3", link("fan") + joint("motor", "continuous", "upper", "fan"))
+    assert (arm["finger_joint"], arm["fingers"], gripper) == ("", [], {})
+    assert remarks[0].startswith("arms.arm: no joint of the hand has limits, so it has no fingers: motor; ")
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_arms_are_mirror_images_where_their_axes_are(name):
+    _, parts = load_folder(name)
+    assert (
+        tuple(mirror_signs(RobotDescription.load(name), [list(arm.joints) for arm in parts.arms.values()]))
+        == parts.mirror
+    )
+
+
+def test_a_hull_with_more_triangles_at_a_corner_than_coal_takes_is_rounded_outwards():
+    angle = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
+    rim = 0.1 * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+    cone = np.array([*rim, (0.0, 0.0, 0.2)])
+    shape = coal_shape(Primitive("cone", "box", (0.2, 0.2, 0.2), np.eye(4), corners=cone))
+    points = np.array(shape.points())  # pyright: ignore[reportAttributeAccessIssue]
+    equations = ConvexHull(points).equations
+    assert (cone @ equations[:, :3].T + equations[:, 3]).max() < 1e-6
+    assert np.abs(points).max() < 0.2 + 0.003
+
+
+def test_a_mesh_whose_corners_are_one_has_few_triangles_enough(tmp_path):
+    pytest.importorskip("fast_simplification")
+    rng = np.random.default_rng(0)
+    # 500 triangles smaller than the distance at which corners are one, around one that is not
+    small = 1e-7 * rng.normal(size=(500, 3, 3))
+    vertices = np.concatenate([small.reshape(-1, 3), TETRAHEDRON])
+    triangles = np.concatenate([np.arange(1500).reshape(-1, 3), FACES + 1500])
+    _, left = simplified(vertices, triangles, 100)
+    assert len(left) <= 100
+
+
+def test_a_flat_mesh_is_given_a_thickness(tmp_path):
+    square = np.array([(0, 0, 0), (0.1, 0, 0), (0.1, 0.1, 0), (0, 0.1, 0)], np.float64)
+    write_stl(tmp_path / "m.stl", square, np.array([(0, 1, 2), (0, 2, 3)]))
+    folder, _ = drafted(tmp_path, robot(mesh("m.stl").split("</visual>")[1]))
+    (shape,) = RobotDescription.from_files(folder / "mine.urdf").links["upper"].collision
+    assert shape.size == pytest.approx((0.1, 0.1, 0.001), abs=1e-6)
+
+
+def test_the_command_takes_arguments_packages_and_says_what_is_left(tmp_path):
+    (tmp_path / "r.urdf.xacro").write_text(XACRO)
+    more = {"urdf": tmp_path / "r.urdf.xacro", "arm": ("arm=base:tip",), "samples": 10, "out": tmp_path / "robots"}
+    refused("--arg 'who=me': expected NAME:=VALUE", new, "mine", **more, arg=("who=me",))
+    refused("--package 'parts': expected NAME=FOLDER", new, "mine", **more, package=("parts",))
+    done = new("mine", **more, arg=("who:=me",), package=(f"parts={tmp_path}",))
+    assert done.data is not None
+    assert (done.data["remarks"], done.data["faults"]) == ([], [])
+    assert isinstance(mujoco.MjModel.from_xml_path(str(tmp_path / "robots" / "mine" / "mine.urdf")), mujoco.MjModel)
