@@ -33,7 +33,8 @@ def mesh_file(name: str, urdf: Path, packages: Mapping[str, Path] | None = None)
 
     Args:
         name: As the URDF says it: a path, absolute or from the folder of the URDF, `file://PATH`, or
-            `package://NAME/PATH`; see `package_folders`.
+            `package://NAME/PATH`; see `package_folders`. A path that is not there but has `/share/NAME/`, as a xacro
+            that was expanded on another machine, is that of a package.
         urdf: File of the description.
         packages: Folders of packages by name.
 
@@ -42,12 +43,16 @@ def mesh_file(name: str, urdf: Path, packages: Mapping[str, Path] | None = None)
     """
     if not name.startswith(_PACKAGE):
         path = urdf.parent / name.removeprefix(_FILE)
-        if not is_file(path):
+        if is_file(path):
+            return path
+        _, _, rest = name.partition("/share/")
+        if "/" not in rest:
             way = "name it from the folder of this file, or by package://NAME/PATH"
             raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: there is no mesh {path}; {way}")
-        return path
-    package, _, rest = name.removeprefix(_PACKAGE).partition("/")
-    tried = [folder / rest for folder in package_folders(package, urdf, packages or {})]
+    else:
+        rest = name.removeprefix(_PACKAGE)
+    package, _, rest = rest.partition("/")
+    tried = [folder / rest.lstrip("/") for folder in package_folders(package, urdf, packages or {})]
     for path in tried:
         if is_file(path):
             return path

@@ -98,13 +98,16 @@ def _group_faults(robot: RobotDescription) -> Iterator[str]:
 def _posture_faults(robot: RobotDescription, contacts: LinkContacts) -> Iterator[str]:
     homes = [robot.semantics.states.get((f"{arm}_arm", "home"), {}) for arm in robot.arms]
     others = {joint: value for home in homes for joint, value in home.items()}
+    touching: dict[tuple[str, ...], list[str]] = {}
     for (group, name), state in robot.semantics.states.items():
         for joint, value in state.items():
             lower, upper = robot.joint(joint).lower, robot.joint(joint).upper
             if not lower - _ROUNDED <= value <= upper + _ROUNDED:
                 yield f"posture {name!r} of {group}: {joint} at {value:g}, expected {lower:g} .. {upper:g}"
-        for pair in sorted(map(sorted, contacts.at({**others, **state}) - robot.allowed_collisions)):
-            yield f"posture {name!r} of {group}: {' and '.join(pair)} touch"
+        for pair in contacts.at({**others, **state}) - robot.allowed_collisions:
+            touching.setdefault(tuple(sorted(pair)), []).append(f"{name!r} of {group}")
+    for pair, postures in sorted(touching.items()):
+        yield f"{' and '.join(pair)} touch in posture {', '.join(postures)}"
 
 
 def _mujoco_faults(robot: RobotDescription, urdf: Path) -> Iterator[str]:

@@ -268,7 +268,7 @@ def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, A
             ends["closed"][name], ends["open"][name] = sorted(
                 (joint.lower, joint.upper), key=lambda q: (round(_gap(robot, arm, q), 6), abs(q))
             )
-            hand = {link for link in robot.links if arm["hand"] in {robot.root, *_links_to(robot, link)}}
+            hand = {link for link in robot.links if arm["flange"] in _links_to(robot, link)}
             for end in (joint.lower, joint.upper, float(np.clip(0.0, joint.lower, joint.upper))):
                 found = contacts.at({joint.name: end}) - adjacent_pairs(robot)
                 touching |= {tuple(sorted(pair)) for pair in found if pair <= hand}

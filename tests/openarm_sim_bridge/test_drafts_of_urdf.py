@@ -108,6 +108,16 @@ def test_a_package_is_where_an_option_or_the_environment_says(tmp_path, monkeypa
         drafted(at, text)
 
 
+def test_a_path_of_another_machine_s_installed_package_is_that_of_the_package(tmp_path):
+    (tmp_path / "parts").mkdir()
+    write_stl(tmp_path / "parts" / "m.stl", TETRAHEDRON, FACES)
+    text = robot(mesh("file:///home/maker/install/parts/share/parts//m.stl"))
+    folder, _ = drafted(tmp_path, text)
+    assert folder_faults(folder) == []
+    words = "there is no mesh /home/maker/m.stl; name it from the folder of this file, or by package://NAME/PATH"
+    refused(words, drafted, tmp_path / "2", robot(mesh("file:///home/maker/m.stl")))
+
+
 XACRO = (
     robot()
     .replace("<link", '<xacro:arg name="long" default="1"/><link', 1)
