@@ -144,6 +144,8 @@ def read_mesh(path: Path, scale: Array) -> tuple[Array, NDArray[np.int64]]:
 
     if not scale.all():
         raise OpenArmError(Code.CONFIG_INVALID, f"mesh {path} has scale {scale.tolist()}, expected no 0")
+    if path.suffix.lower() == ".dae":
+        _parse_xml(path)  # the reader may never end with one that is cut off
     try:
         loaded = coal.MeshLoader().load(str(path), scale)
     except (RuntimeError, ValueError) as error:
@@ -154,6 +156,13 @@ def read_mesh(path: Path, scale: Array) -> tuple[Array, NDArray[np.int64]]:
         text = "has points that are not finite" if len(triangles) else "has no triangle"
         raise OpenArmError(Code.CONFIG_INVALID, f"mesh {path} {text}")
     return vertices, triangles
+
+
+def _parse_xml(path: Path) -> None:
+    try:
+        ET.parse(path)
+    except (ET.ParseError, LookupError, ValueError) as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"can't read mesh {path}: {said(error)}") from error
 
 
 def is_convex(vertices: Array, triangles: NDArray[np.int64]) -> bool:

@@ -10,9 +10,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.robot.convex import hull_of
 from openarm_common.robot.description import Joint, Primitive, RobotDescription
 from openarm_common.types import Array
 
@@ -147,8 +148,19 @@ def _fits_coal(triangles: NDArray[np.int64]) -> bool:
 
 
 def hull_mesh(points: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the vertices (n, 3) of the convex hull of points, and its triangles (m, 3) turned outwards."""
-    hull = ConvexHull(points)
+    """Return the vertices (n, 3) of the convex hull of points, and its triangles (m, 3) turned outwards.
+
+    Points without a volume are given one.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, for points that have no hull in double precision.
+    """
+    points = hull_of(points)[0]
+    try:
+        hull = ConvexHull(points)
+    except QhullError as error:
+        size = np.ptp(points, axis=0).max()
+        raise OpenArmError(Code.CONFIG_INVALID, f"a shape {size:.3g} m long has no convex hull") from error
     index = np.full(len(points), -1, np.int64)
     index[hull.vertices] = np.arange(len(hull.vertices))
     a, b, c = (points[hull.simplices[:, k]] for k in range(3))

@@ -19,7 +19,7 @@ from openarm_common.robot.folder import load_folder, robot_names
 from openarm_common.robot.meshes import is_convex, read_mesh
 from openarm_common.robot.urdf import Primitive
 from openarm_sim_bridge.drafting.check import folder_faults
-from openarm_sim_bridge.drafting.collisions import coal_shape
+from openarm_sim_bridge.drafting.collisions import coal_shape, hull_mesh
 from openarm_sim_bridge.drafting.draft import Draft, draft_folder, mirror_signs
 from openarm_sim_bridge.drafting.mesh_files import simplified, write_stl
 from openarm_sim_bridge.world.model import import_urdf
@@ -223,6 +223,15 @@ def test_meshes_that_mujoco_does_not_read_become_stl(tmp_path, name, write):
     assert folder_faults(folder) == []
     model = import_urdf(RobotDescription.from_files(folder / "mine.urdf")).compile()
     assert model.nmesh == 1
+
+
+def test_a_mesh_of_collada_that_is_cut_off_and_one_without_a_volume_end_in_a_sentence_and_a_box(tmp_path):
+    dae(tmp_path / "m.dae")
+    (tmp_path / "m.dae").write_text((tmp_path / "m.dae").read_text()[:-200])
+    refused("can't read mesh .*/m.dae: unclosed token|no element found", drafted, tmp_path, robot(mesh("m.dae")))
+    flat, triangles = hull_mesh(TETRAHEDRON * (1.0, 1.0, 0.0))
+    np.testing.assert_allclose(np.ptp(flat, axis=0), (0.03, 0.02, 0.001))
+    assert len(triangles) == 12
 
 
 def test_settings_of_mujoco_textures_and_parts_of_other_programs_are_no_hindrance(tmp_path):
