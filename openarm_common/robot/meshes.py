@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
@@ -24,6 +25,8 @@ _PACKAGE, _FILE = "package://", "file://"
 #: How far corners of a convex mesh may be outside the plane of a triangle, and how low a triangle may be that says
 #: nothing about its plane: shares of the mesh's diagonal.
 _FLAT, _SLIVER = 1e-4, 1e-3
+#: Elements of Collada that are lists of indices or counts.
+_INDICES = ("p", "v", "vcount", "h")
 #: Distances of corners to planes that are in memory at once.
 _BLOCK = 1_000_000
 
@@ -145,7 +148,7 @@ def read_mesh(path: Path, scale: Array) -> tuple[Array, NDArray[np.int64]]:
     if not scale.all():
         raise OpenArmError(Code.CONFIG_INVALID, f"mesh {path} has scale {scale.tolist()}, expected no 0")
     if path.suffix.lower() == ".dae":
-        _parse_xml(path)  # the reader may never end with one that is cut off
+        _check_collada(path)
     try:
         loaded = coal.MeshLoader().load(str(path), scale)
     except (RuntimeError, ValueError) as error:
@@ -158,11 +161,16 @@ def read_mesh(path: Path, scale: Array) -> tuple[Array, NDArray[np.int64]]:
     return vertices, triangles
 
 
-def _parse_xml(path: Path) -> None:
+def _check_collada(path: Path) -> None:
+    """Refuse what the reader of Collada would never end with: no XML, and indices that are no numbers."""
     try:
-        ET.parse(path)
+        root = ET.parse(path).getroot()
     except (ET.ParseError, LookupError, ValueError) as error:
         raise OpenArmError(Code.CONFIG_INVALID, f"can't read mesh {path}: {said(error)}") from error
+    for element in root.iter():
+        tag = element.tag.rpartition("}")[2]
+        if tag in _INDICES and not re.fullmatch(r"[\s\d-]*", element.text or ""):
+            raise OpenArmError(Code.CONFIG_INVALID, f"can't read mesh {path}: <{tag}> has indices that are no numbers")
 
 
 def is_convex(vertices: Array, triangles: NDArray[np.int64]) -> bool:

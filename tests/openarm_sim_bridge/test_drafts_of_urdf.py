@@ -229,6 +229,9 @@ def test_a_mesh_of_collada_that_is_cut_off_and_one_without_a_volume_end_in_a_sen
     dae(tmp_path / "m.dae")
     (tmp_path / "m.dae").write_text((tmp_path / "m.dae").read_text()[:-200])
     refused("can't read mesh .*/m.dae: unclosed token|no element found", drafted, tmp_path, robot(mesh("m.dae")))
+    dae(tmp_path / "n.dae")
+    (tmp_path / "n.dae").write_text((tmp_path / "n.dae").read_text().replace("<p>0 2 1", "<p>0 2B1"))
+    refused("can't read mesh .*/n.dae: <p> has indices that are no numbers", drafted, tmp_path, robot(mesh("n.dae")))
     flat, triangles = hull_mesh(TETRAHEDRON * (1.0, 1.0, 0.0))
     np.testing.assert_allclose(np.ptp(flat, axis=0), (0.03, 0.02, 0.001))
     assert len(triangles) == 12
