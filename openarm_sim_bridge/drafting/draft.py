@@ -181,7 +181,8 @@ def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> tuple[
         remarks.append(f"{what}; give one limits, then draft again")
     if len(moved) == 1:
         what = f"arms.{name}: {moved[0].name!r} moves one finger, {moved[0].child!r}"
-        remarks.append(f"{what}; where the other is a part of {moved[0].parent!r}, add that to fingers in robot.yaml")
+        way = f"where the other is a part of {moved[0].parent!r}, add that to fingers in robot.yaml"
+        remarks.append(f"{what}; {way}; which end is closed is a guess, see gripper in semantics.yaml")
     parts = {
         "base": base,
         "joints": [joint.name for joint in joints],
