@@ -311,12 +311,12 @@ def test_a_map_of_another_robot_is_refused_and_leaves_the_map_as_it_was(tmp_path
     )
     other.clear_box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1), OCCUPIED)
     nodes = other.save(tmp_path / "map.ot")
-    assert other.load(tmp_path / "map.ot")[0] == nodes
+    assert other.load(tmp_path / "map.ot").nodes == nodes
     refused(r"map\.ot is of robot 'openarm_v1', expected 'nearer'", mine.load, tmp_path / "map.ot")
     assert not np.any(mine.snapshot({"states"}).states == OCCUPIED)
     text = (tmp_path / "map.ot").read_bytes().replace(b"# robot openarm_v1\n", b"")
     (tmp_path / "foreign.ot").write_bytes(text)  # as other programs write it
-    assert mine.load(tmp_path / "foreign.ot")[0] == nodes
+    assert mine.load(tmp_path / "foreign.ot").nodes == nodes
 
 
 @pytest.mark.parametrize("line", (Path(__file__).parent / "data/resampled.sha256").read_text().splitlines())

@@ -120,8 +120,10 @@ def _read(bag: Bag, description: RobotDescription) -> tuple[list[_Shot], RobotSt
     topics: dict[str, tuple[str, str]] = {}
     for name in cameras:
         with suppress(OpenArmError):  # the bag has no such camera
-            chosen = camera_topics({topic: kind for topic, kind in kinds.items() if topic.startswith(f"/{name}/")})
-            topics |= {chosen.color: (name, "color"), chosen.depth: (name, "depth"), chosen.info: (name, "info")}
+            mine = {topic: kind for topic, kind in kinds.items() if topic.startswith(f"/{name}/")}
+            chosen = camera_topics(mine, known=True)  # by either CameraInfo: they are one in this suite
+            info = chosen.depth_info or chosen.info
+            topics |= {chosen.color: (name, "color"), chosen.depth: (name, "depth"), info: (name, "info")}
     found = messages_of(bag, [*topics, "/joint_states", "/tf_static"])
     states = RobotStateBuffer(description, capacity=max(len(found["/joint_states"]), 1))
     for message in found["/tf_static"]:
