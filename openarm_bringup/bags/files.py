@@ -116,10 +116,11 @@ def _what(path: Path, first: bytes) -> str:
     """Return what a file is that is no storage of rosbag2, and what to do."""
     if not first:
         return "is empty"
+    convert = shutil.which("rosbags-convert", path=Path(sys.executable).parent) or "rosbags-convert"
     names = {
         "path": shlex.quote(str(path)),
         "stem": shlex.quote(str(path.with_name(path.name.partition(".")[0]))),
-        "convert": shutil.which("rosbags-convert", path=Path(sys.executable).parent) or "rosbags-convert",
+        "convert": shlex.quote(convert),
     }
     for magic, text in _OTHERS:
         if first.startswith(magic):
