@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -27,10 +29,12 @@ def interface(name: str) -> Any:
     """
     parts = name.split("/")
     if len(parts) == 3 and parts[1] in _KINDS and parts[0].isidentifier():
-        try:
-            known = vars(importlib.import_module(f"{parts[0]}.{parts[1]}"))
-        except ModuleNotFoundError:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"the package {parts[0]!r} is not installed") from None
+        # A name may come from a file: of a package without messages not even its `__init__` is executed.
+        package = importlib.util.find_spec(parts[0])
+        folders = (package and package.submodule_search_locations) or ()
+        if not any((Path(folder) / parts[1]).is_dir() for folder in folders):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"the package {parts[0]!r} is not installed")
+        known = vars(importlib.import_module(f"{parts[0]}.{parts[1]}"))
         if not isinstance(known.get(parts[2]), type):
             raise unknown(f"type in {parts[0]}/{parts[1]}", parts[2], [k for k in known if k[0].isupper()])
         return known[parts[2]]

@@ -137,16 +137,12 @@ def at_stored_zeros(samples: SampleSet, store: Path | None) -> SampleSet:
     Raises:
         OpenArmError: CONFIG_INVALID, when the stored zeros are damaged.
     """
-    from openarm_common.records import OfAnotherRobot
     from openarm_common.robot.zeros import REAL
 
     of = samples.head.zeros_of
     if samples.foreign or (of == REAL and samples.head.mount_seed is not None):  # simulated, by an older version
         return samples
-    try:
-        return samples.with_zeros(zeros_in(store).in_use(of).record.offsets)
-    except OfAnotherRobot:
-        return samples
+    return samples.with_zeros(zeros_in(store).in_use(of).record.offsets)
 
 
 def _from_session(path: Path, source: Source) -> tuple[SampleSet, str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from openarm_common.records import Found, Record, RecordStore
+from openarm_common.records import Found, OfAnotherRobot, Record, RecordStore
 from openarm_common.robot.zeros import REAL
 
 
@@ -47,9 +47,13 @@ class ZeroStore(RecordStore[StoredZeros]):
         return super().save(record)
 
     def in_use(self, of: str) -> Found[StoredZeros]:
-        """Return the zeros of a robot; those of its description where none are stored.
+        """Return the zeros of a robot; those of its description where none are stored, or those of another robot.
 
         Raises:
-            OpenArmError: As `find`.
+            OpenArmError: CONFIG_INVALID, when the file is damaged and the history has no good one.
         """
-        return self.find(of) or Found(StoredZeros(of=of, offsets={}))
+        try:
+            found = self.find(of)
+        except OfAnotherRobot:
+            found = None
+        return found or Found(StoredZeros(of=of, offsets={}))

@@ -44,7 +44,7 @@ def calibrate_once(mount_seed: int, on_note: Callable[[str], None]) -> None:
     on_note(f"no calibration of mount seed {mount_seed} yet: {', '.join(cameras)} are calibrated first, once")
     store = default_folder() / f"mount_seed_{mount_seed}"
     listeners = CalibrationListeners(on_camera=lambda camera: on_note(f"calibrating {camera}"))
-    zeros = ZeroStore(default_folder()).find(zeros_name(load_graph(GRAPH))) is None
+    zeros = not ZeroStore(default_folder()).history(zeros_name(load_graph(GRAPH)))
     options = CalibrationOptions(
         cameras, mount_seed=mount_seed, save=True, zeros=zeros, zeros_store=default_folder(), store=store
     )

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 from geometry_msgs.msg import PoseArray, PoseStamped
 from openarm_interfaces.srv import Grasp
@@ -67,6 +69,13 @@ def test_types_that_do_not_exist_are_refused(name: str, said: str) -> None:
     with pytest.raises(OpenArmError) as refused:
         interface(name)
     assert said in refused.value.message
+
+
+def test_a_package_that_has_no_messages_is_not_imported() -> None:
+    sys.modules.pop("this", None)
+    with pytest.raises(OpenArmError, match="'this' is not installed"):
+        interface("this/msg/A")
+    assert "this" not in sys.modules
 
 
 def test_names_that_are_nearly_right_are_suggested() -> None:

@@ -95,6 +95,7 @@ def test_the_way_back_from_the_first_zeros_leads_to_the_description(
     monkeypatch.setenv(folder.ROBOT, "panda")
     with pytest.raises(OfAnotherRobot):
         store.load("zeros")
+    assert store.in_use("zeros").record.offsets == {}
 
 
 def test_labels_tell_zeros_apart_and_none_has_no_label() -> None:
