@@ -32,7 +32,7 @@ class Library:
 
 
 def imports(module: str) -> Iterator[tuple[str, float, tuple[str, ...]]]:
-    """Yield each module that an import loads, its own time in ms, and the modules whose import led to it, first to last.
+    """Yield each module that an import loads, its own time in ms, and the modules that led to it, first to last.
 
     Raises:
         RuntimeError: The module cannot be imported.
@@ -72,9 +72,8 @@ def main() -> None:
         if node.module is None or args.node not in (None, name):
             continue
         found = libraries(imports(node.module))
-        print(
-            f"\n{name}: {sum(one.ms for one in found.values()):.0f} ms, {sum(one.modules for one in found.values())} modules"
-        )
+        ms, modules = sum(one.ms for one in found.values()), sum(one.modules for one in found.values())
+        print(f"\n{name}: {ms:.0f} ms, {modules} modules")
         for library, one in sorted(found.items(), key=lambda item: -item[1].ms):
             if one.ms >= args.above:
                 print(f"  {library:22} {one.ms:6.0f} ms {one.modules:5}  {' > '.join(one.asked_by)}")
