@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 from benchmarks.report import Row, write_report
 from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, Intrinsics
+from openarm_common.camera.lens import Lens
 from openarm_common.types import Bytes, Floats
 from openarm_perception.geometry.depth import DepthLimits
 from openarm_perception.stereo.matching import StereoConfig, StereoMatcher
-from openarm_perception.stereo.rectification import Lens, Rectification
+from openarm_perception.stereo.rectification import Rectification
 from openarm_sim_bridge.cameras.noise import ColourNoiseConfig, add_colour_noise
 from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
 from openarm_sim_bridge.world.scenery import add_cameras, add_environment
@@ -148,7 +149,7 @@ def main() -> None:
     views = cameras(args.baseline, args.fovy)
     lens = views["left"].intrinsics
     pose = se3.make(None, (args.baseline, 0.0, 0.0))
-    matcher = StereoMatcher(StereoConfig(), Rectification.from_pose(Lens.of(lens), Lens.of(lens), pose), LIMITS)
+    matcher = StereoMatcher(StereoConfig(), Rectification.from_pose(Lens(lens), Lens(lens), pose), LIMITS)
     ours: list[Floats] = []
     peers: list[Floats] = []
     truths: list[Floats] = []

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.fuzz.alter import HOSTILE, altered_bytes
-from benchmarks.fuzz.files import BAG
+from benchmarks.fuzz.files.reader import BAG
 from benchmarks.fuzz.hostile import hostile, plausible
 from benchmarks.fuzz.judge import Tally, peak_mib, reset_peak, where
 from openarm_bringup.messages import interface

@@ -25,6 +25,8 @@ def perceive(
     start: float = 0.0,
     out: Path | None = None,
     depth_scale: float | None = None,
+    rectified: bool | None = None,
+    registered: bool | None = None,
     pose: Path | None = None,
     background: Path | None = None,
     near: float = 0.1,
@@ -40,9 +42,9 @@ def perceive(
     camera_infos and /tf_static; depth of files must be aligned.
 
     Args:
-        files: Colour image (PNG, JPEG) and depth image (PNG of 16 bits, 0 where nothing was measured, or TIFF of
-            floats); or a cloud (.pcd, .ply, .npy, .xyz); or a bag (folder of rosbag2, .mcap, .db3); or nothing, for a
-            camera of the running graph.
+        files: Colour image (PNG, JPEG) and depth image (PNG or .npy of 16 bits, 0 where nothing was measured, TIFF or
+            .npy of floats); or a cloud (.pcd, .ply, .npy, .xyz); or a bag (folder of rosbag2, .mcap, .db3); or
+            nothing, for a camera of the running graph.
         info: Intrinsics of images, with distortion: YAML of a CameraInfo, of OpenCV or Kalibr, JSON, or three rows of
             three numbers. Of a bag or graph: topic of the colour image's CameraInfo, or such a file.
         color: Topic of the colour image in a bag or graph, also compressed; by the names of drivers when not given.
@@ -53,6 +55,10 @@ def perceive(
         out: Folder for pictures, the label image and a page.
         depth_scale: Metres of a count of depth, of every encoding: 0.0001 for a D405, 0.0002 for TUM, 0.001 for floats
             in mm; 0.001 for integers and 1 for floats when not given.
+        rectified: Whether the images of a bag or graph are without distortion, whatever their CameraInfo says; by the
+            names of their topics, such as image_rect, when not given.
+        registered: Whether the depth of a bag or graph lies on the pixels of the colour image, whatever its frame is
+            called; by the name of its topic, such as depth_registered, when not given.
         pose: Text file with the camera's pose (optical frame), four rows of four numbers, in a frame whose z is up.
         background: Depth image, or cloud, of the empty table or box from the same place.
         near: Nearest depth that counts, m.
@@ -71,7 +77,7 @@ def perceive(
     from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
     from openarm_perception.frames.clouds import is_cloud, read_cloud
     from openarm_perception.frames.found import find
-    from openarm_perception.frames.images import read_depth, read_frame, read_pose
+    from openarm_perception.frames.images import is_depth, read_depth, read_frame, read_pose
     from openarm_perception.geometry.depth import UNLIMITED, DepthLimits
 
     if not 0.0 < near < far <= 1000.0:
@@ -85,15 +91,18 @@ def perceive(
     cloud = None
     bag = len(files) == 1 and not is_cloud(files[0]) and (files[0].is_dir() or is_recording(files[0]))
     of_topics = bag or not files
-    if not of_topics and (color or depth or camera):
+    if not of_topics and (color or depth or camera or (rectified, registered) != (None, None)):
         raise OpenArmError(
-            Code.INVALID_ARGUMENT, "--color, --depth and --camera are for topics of a bag or of the running graph"
+            Code.INVALID_ARGUMENT,
+            "--color, --depth, --camera, --rectified and --registered are for topics of a bag or of the running graph",
         )
     if of_topics:
-        from openarm_bringup.ros.camera_frame import CameraChoice, frame_of_bag, frame_of_graph
+        from openarm_bringup.ros.camera_frame import frame_of_bag, frame_of_graph
+        from openarm_perception.ros.frames import CameraChoice
 
         lens = read_lens(Path(info)) if info and Path(info).is_file() else None
-        chosen = CameraChoice(camera, color, depth, "" if lens else info, lens, depth_scale)
+        topic = "" if lens else info
+        chosen = CameraChoice(camera, color, depth, topic, lens, depth_scale, rectified, registered)
         if not bag:
             join_graph(domain)
         frame = frame_of_bag(files[0], chosen, start) if bag else frame_of_graph(chosen, timeout)
@@ -111,11 +120,10 @@ def perceive(
     else:
         frame = read_frame(*files, Path(info), depth_scale, UNLIMITED)
     empty = None
-    if background is not None and is_cloud(background):
+    if background is not None and is_cloud(background) and not is_depth(background):
         empty = read_cloud(background, limits, unit, cloud_frame, cloud).frame.points
     elif background is not None:
-        lens = read_lens(Path(info), frame.size) if info and not of_topics else Lens(frame.intrinsics)
-        empty = read_depth(background, lens, depth_scale, UNLIMITED)
+        empty = read_depth(background, frame.lens or Lens(frame.intrinsics), depth_scale, UNLIMITED)
     if pose is not None and cloud is not None and cloud.T_base_camera is not None:
         raise OpenArmError(Code.INVALID_ARGUMENT, "--pose is that of a camera; expected none with --cloud-frame base")
     T_base_camera = read_pose(pose) if pose is not None else None if cloud is None else cloud.T_base_camera

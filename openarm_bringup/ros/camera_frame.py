@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,46 +14,12 @@ from openarm_bringup.bags.bag import open_bag
 from openarm_bringup.bags.ros.messages import contents, message_of, messages_of
 from openarm_bringup.messages import interface
 from openarm_bringup.ros.peer import Frames
-from openarm_common.camera.lens import Lens
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import ContextNode
 from openarm_common.ros.node import QOS_STATIC_TF
 from openarm_perception.frames.images import Frame
 from openarm_perception.geometry.depth import UNLIMITED
-from openarm_perception.ros.frames import CameraTopics, FrameBuilder, camera_topics
-
-#: Frames of a bag that are tried, where the first ones can't be read.
-_FAULTS = 30
-
-
-@dataclass(frozen=True)
-class CameraChoice:
-    """Which camera, and what its depth is.
-
-    Attributes:
-        camera: Namespace or a part of it; "": the only one.
-        color: Topic of the colour image; "": found by the names that drivers use.
-        depth: Topic of the depth image, likewise.
-        info: Topic of the CameraInfo of the colour image, likewise.
-        lens: Lens of the colour camera; None: its CameraInfo says it.
-        depth_scale: Metres of a count of depth; None as for `metres`.
-    """
-
-    camera: str = ""
-    color: str = ""
-    depth: str = ""
-    info: str = ""
-    lens: Lens | None = None
-    depth_scale: float | None = None
-
-    def topics(self, kinds: Mapping[str, str]) -> CameraTopics:
-        """Return its topics among those that there are, types by topic; errors as `camera_topics`."""
-        known = self.lens is not None
-        return camera_topics(kinds, self.camera, color=self.color, depth=self.depth, info=self.info, known=known)
-
-    def builder(self, topics: CameraTopics, frames: Frames) -> FrameBuilder:
-        """Return a builder of frames of these topics."""
-        return FrameBuilder(topics, UNLIMITED, self.depth_scale, self.lens, frames.between)
+from openarm_perception.ros.frames import CameraChoice, CameraTopics, FrameBuilder, camera_topics
 
 
 class _Camera(ContextNode):
@@ -65,28 +29,30 @@ class _Camera(ContextNode):
         super().__init__("perceive", bare=True)
         self._frames = Frames()
         self._frame: Frame | None = None
-        self._fault: OpenArmError | None = None
 
     def frame(self, chosen: CameraChoice, timeout: float) -> Frame:
         self._node.create_subscription(TFMessage, "/tf_static", self._take_static, QOS_STATIC_TF)
         self.spin_until(partial(self._topics, chosen), timeout)
         kinds = self._kinds()
-        topics = self._topics(chosen) or chosen.topics(kinds)  # raises: says what there is
-        builder = chosen.builder(topics, self._frames)
+        topics = self._topics(chosen) or camera_topics(kinds, chosen)  # raises: says what there is
+        builder = FrameBuilder(topics, UNLIMITED, chosen, self._frames.between)
         for topic in filter(None, topics):
             take = partial(self._take, builder, topic)
             self._node.create_subscription(interface(kinds[topic]), topic, take, qos_profile_sensor_data)
-        self.spin_until(lambda: self._frame or (self._fault and self._fault.code is not Code.NO_TRANSFORM), timeout)
-        if self._frame is not None:
-            return self._frame
-        raise self._fault or OpenArmError(Code.TIMEOUT, f"no frame within {timeout:g} s: {builder.missing()}")
+        # transforms may come later than frames
+        self.spin_until(
+            lambda: self._frame or (builder.given_up and builder.faults[-1].code is not Code.NO_TRANSFORM), timeout
+        )
+        if self._frame is None:
+            raise builder.failure(Code.TIMEOUT, f"no frame within {timeout:g} s")
+        return self._frame
 
     def _kinds(self) -> dict[str, str]:
         return {name: kinds[0] for name, kinds in self._node.get_topic_names_and_types()}
 
     def _topics(self, chosen: CameraChoice) -> CameraTopics | None:
         try:
-            return chosen.topics(self._kinds())
+            return camera_topics(self._kinds(), chosen)
         except OpenArmError:
             return None
 
@@ -97,7 +63,7 @@ class _Camera(ContextNode):
         try:
             self._frame = self._frame or builder.take(topic, message)
         except OpenArmError as error:
-            self._fault = error
+            builder.faults.append(error)
 
 
 def frame_of_graph(chosen: CameraChoice, timeout: float) -> Frame:
@@ -127,28 +93,25 @@ def frame_of_bag(path: Path, chosen: CameraChoice, start_s: float) -> Frame:
             such frame; BAD_IMAGE; NO_TRANSFORM.
     """
     with open_bag(path) as bag:
-        topics = chosen.topics({topic: kind for topic, (kind, _) in bag.topics.items()})
+        topics = camera_topics({topic: kind for topic, (kind, _) in bag.topics.items()}, chosen)
         frames = Frames()
         with contents(bag):
             for message in messages_of(bag, ["/tf_static"])["/tf_static"]:
                 frames.add(message, 0, True)
-            builder = chosen.builder(topics, frames)
+            builder = FrameBuilder(topics, UNLIMITED, chosen, frames.between)
             # camera_info may have come once, before the time that is asked for
             for info in filter(None, (topics.info, topics.depth_info)):
                 for record in bag.records([info]):
                     builder.take(record.topic, message_of(bag, record))
                     break
-            faults: list[OpenArmError] = []
             for record in bag.records([topic for topic in topics if topic], start_s):
                 try:
                     frame = builder.take(record.topic, message_of(bag, record))
-                except OpenArmError as error:  # a later one may be whole
-                    faults.append(error)
+                except OpenArmError as error:
+                    builder.faults.append(error)
                     frame = None
                 if frame is not None:
                     return frame
-                if len(faults) >= _FAULTS:
+                if builder.given_up:
                     break
-            if faults:
-                raise faults[0]
-    raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} has no frame from {start_s:g} s on: {builder.missing()}")
+    raise builder.failure(Code.INVALID_ARGUMENT, f"{path} has no frame from {start_s:g} s on")

@@ -59,8 +59,9 @@ def detect_undistorted(board: Board, image: Bytes, lens: Lens) -> tuple[BoardDet
     Raises:
         OpenArmError: NOTHING_DETECTED; BAD_IMAGE, for an image of another size, or a distortion without an inverse.
     """
+    straight = lens.rectified(image)
     seen = detect(board, image)
-    return BoardDetection(seen.ids, lens.undistorted(seen.pixels), seen.residual), lens.rectified(image)
+    return BoardDetection(seen.ids, lens.undistorted(seen.pixels), seen.residual), straight
 
 
 def guess_pose(points: Array, pixels: Array, radius: float, intrinsics: Intrinsics) -> tuple[Array, float]:

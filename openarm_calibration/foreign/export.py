@@ -11,7 +11,6 @@ import yaml
 from openarm_calibration.store.store import StoredCalibration
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
-from openarm_common.camera.lens import Lens
 from openarm_common.camera.lens_files import camera_info
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -40,7 +39,7 @@ def exported(item: StoredCalibration, form: str, *, optical: bool, child: str = 
                 Code.INVALID_ARGUMENT,
                 f"the calibration of {item.camera!r} has no intrinsics: it is of pose pairs, or old",
             )
-        return camera_info(item.camera, Lens(item.intrinsics))
+        return camera_info(item.camera, item.intrinsics)
     T = item.T_parent_link @ T_LINK_OPTICAL if optical else item.T_parent_link
     child = child or f"{item.camera}_{'color_optical_frame' if optical else 'link'}"
     if form == "easy_handeye2":

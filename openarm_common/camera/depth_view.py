@@ -46,7 +46,7 @@ def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> Non
     Args:
         what: Name of the image.
         shape: Of the image.
-        intrinsics: Of its CameraInfo.
+        intrinsics: Those that are said to be its camera's.
 
     Raises:
         OpenArmError: BAD_IMAGE, naming the image and both sizes.
@@ -54,8 +54,8 @@ def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> Non
     if shape[:2] != (intrinsics.height, intrinsics.width):
         raise OpenArmError(
             Code.BAD_IMAGE,
-            f"{what} is {shape[1]}x{shape[0]} pixels, but its CameraInfo says {intrinsics.width}x{intrinsics.height}; "
-            "both must come from the same stream",
+            f"{what} is {shape[1]}x{shape[0]} pixels, but its CameraInfo, or the file of its intrinsics, says"
+            f" {intrinsics.width}x{intrinsics.height}; both must come from the same stream",
         )
 
 

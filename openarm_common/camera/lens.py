@@ -66,6 +66,11 @@ class Lens:
         """Whether the model is that of `cv2.fisheye`."""
         return self.model in _FISHEYE
 
+    @property
+    def d(self) -> Array:
+        """The coefficients as OpenCV takes them; those of fisheyes beyond its four are none of its model."""
+        return np.array(self.coefficients[: 4 if self.fisheye else None] or (0.0,) * 4)
+
     def undistorted(self, pixels: Array) -> Array:
         """Return pixels (n, 2) where a camera with the same K and no distortion shows them.
 
@@ -74,9 +79,9 @@ class Lens:
         """
         if self.straight:
             return pixels
-        K, d, raw = self.intrinsics.matrix, np.array(self.coefficients), pixels.reshape(-1, 1, 2)
+        K, d, raw = self.intrinsics.matrix, self.d, pixels.reshape(-1, 1, 2)
         if self.fisheye:
-            rays = cv2.fisheye.undistortPoints(raw, K, d[:4])
+            rays = cv2.fisheye.undistortPoints(raw, K, d)
         else:
             rays = cv2.undistortPointsIter(raw, K, d, np.eye(3), np.eye(3), _STOP)
         rays = rays.reshape(-1, 2).astype(np.float64)
@@ -95,9 +100,9 @@ class Lens:
 
     def distorted(self, rays: Array) -> Array:
         """Return the pixels (n, 2) at which the lens shows rays (n, 2): x over z and y over z."""
-        K, d = self.intrinsics.matrix, np.array(self.coefficients)
+        K, d = self.intrinsics.matrix, self.d
         if self.fisheye:
-            return cv2.fisheye.distortPoints(rays[:, None], K, d[:4]).reshape(-1, 2).astype(np.float64)
+            return cv2.fisheye.distortPoints(rays[:, None], K, d).reshape(-1, 2).astype(np.float64)
         if self.model in _LIBREALSENSE:
             return _of_librealsense(rays, d) * np.diag(K)[:2] + K[:2, 2]
         whole = np.column_stack([rays, np.ones(len(rays))])
@@ -109,10 +114,11 @@ class Lens:
         Raises:
             OpenArmError: BAD_IMAGE, for a picture of another size.
         """
+        check_size("colour image", picture.shape, self.intrinsics)
         if self.straight:
             return picture
-        maps = self._maps_for(picture)
-        return cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8, copy=False)
+        out = cv2.remap(picture, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return out.astype(np.uint8, copy=False)
 
     def rectified_depth(self, depth: NDArray[Any]) -> NDArray[Any]:
         """Return a depth image (h, w) without distortion; depths are not mixed, and 0 where the lens sees nothing.
@@ -120,14 +126,30 @@ class Lens:
         Raises:
             OpenArmError: BAD_IMAGE, for an image of another size.
         """
+        check_size("depth image", depth.shape, self.intrinsics)
         if self.straight:
             return depth
-        maps = self._maps_for(depth)
-        return cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderValue=(0.0,)).astype(depth.dtype, copy=False)
+        return cv2.remap(depth, *_maps(self), cv2.INTER_NEAREST, borderValue=(0.0,)).astype(depth.dtype, copy=False)
 
-    def _maps_for(self, picture: NDArray[Any]) -> tuple[Floats, Floats]:
-        check_size("image", picture.shape, self.intrinsics)
-        return _maps(self)
+    def maps(self, R: Array, P: Array) -> tuple[Floats, Floats]:
+        """Return column and row (h, w) at which the lens shows each pixel of a camera without distortion.
+
+        Args:
+            R: (3, 3) rotation from the frame of the lens to that of the other camera.
+            P: (3, 3) K of the other camera, of images of the same size.
+        """
+        k, d = self.intrinsics, self.d
+        size = (k.width, k.height)
+        if self.model in _LIBREALSENSE:
+            v, u = np.indices(size[::-1]).reshape(2, -1)
+            rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(P @ R).T
+            at = self.distorted(rays[:, :2] / rays[:, 2:]).astype(np.float32)
+            return at[:, 0].reshape(size[::-1]), at[:, 1].reshape(size[::-1])
+        if self.fisheye:
+            maps = cv2.fisheye.initUndistortRectifyMap(k.matrix, d, R, P, size, cv2.CV_32FC1)
+        else:
+            maps = cv2.initUndistortRectifyMap(k.matrix, d, R, P, size, cv2.CV_32FC1)
+        return maps[0].astype(np.float32, copy=False), maps[1].astype(np.float32, copy=False)
 
 
 def _of_librealsense(rays: Array, d: Array) -> Array:
@@ -141,18 +163,8 @@ def _of_librealsense(rays: Array, d: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def _maps(lens: Lens) -> tuple[Floats, Floats]:
-    """Return column and row (h, w) in a picture of the lens for each pixel of the pinhole camera."""
-    k, d = lens.intrinsics, np.array(lens.coefficients)
-    if lens.model in _LIBREALSENSE:
-        x, y = np.meshgrid(*(axis.astype(np.float64) for axis in k.rays))
-        at = lens.distorted(np.column_stack([x.ravel(), y.ravel()])).astype(np.float32)
-        return at[:, 0].reshape(k.height, k.width), at[:, 1].reshape(k.height, k.width)
-    K, size = k.matrix, (k.width, k.height)
-    if lens.fisheye:
-        maps = cv2.fisheye.initUndistortRectifyMap(K, d[:4], np.eye(3), K, size, cv2.CV_32FC1)
-    else:
-        maps = cv2.initUndistortRectifyMap(K, d, np.eye(3), K, size, cv2.CV_32FC1)
-    return maps[0].astype(np.float32, copy=False), maps[1].astype(np.float32, copy=False)
+    """Return the maps to a pinhole camera with the same K."""
+    return lens.maps(np.eye(3), lens.intrinsics.matrix)
 
 
 def lens_of(size: Sequence[int], k: Sequence[float], model: str, coefficients: Sequence[float], where: str) -> Lens:

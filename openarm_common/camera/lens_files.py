@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 import yaml
 
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.lens import Lens, lens_of
 from openarm_common.documents import number, read_cells, read_document
 from openarm_common.errors import Code, OpenArmError
@@ -182,15 +183,13 @@ def _listed(value: Any) -> list[float]:
     return numbers
 
 
-def camera_info(name: str, lens: Lens) -> str:
-    """Return the camera_info YAML of a camera, as camera_calibration_parsers reads it.
+def camera_info(name: str, optics: Intrinsics) -> str:
+    """Return the camera_info YAML of a camera without distortion, as camera_calibration_parsers reads it.
 
     Args:
         name: Name of the camera.
-        lens: Its intrinsics.
+        optics: Its intrinsics.
     """
-    optics = lens.intrinsics
-    d = list(lens.coefficients) or [0.0] * 5
     K: Any = optics.matrix.ravel().tolist()
     P: Any = np.hstack([optics.matrix, np.zeros((3, 1))]).ravel().tolist()
     document: dict[str, Any] = {
@@ -198,8 +197,8 @@ def camera_info(name: str, lens: Lens) -> str:
         "image_height": optics.height,
         "camera_name": name,
         "camera_matrix": {"rows": 3, "cols": 3, "data": K},
-        "distortion_model": "plumb_bob" if lens.straight else lens.model,
-        "distortion_coefficients": {"rows": 1, "cols": len(d), "data": d},
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
         "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
         "projection_matrix": {"rows": 3, "cols": 4, "data": P},
     }

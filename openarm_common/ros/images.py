@@ -7,8 +7,10 @@ ndarray costs 187 ms for a 640×480 depth image, an `array.array` 0.2 ms); data 
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, cast
 
 import cv2
@@ -21,7 +23,7 @@ from openarm_common.camera.pictures import decode_depth, decode_picture, to_byte
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 from openarm_common.ros.convert import byte_array, header
-from openarm_common.types import Bytes, Floats
+from openarm_common.types import Array, Bytes, Floats
 
 AnyImage = Image | CompressedImage
 
@@ -46,8 +48,21 @@ _COLORS: dict[str, tuple[type[np.generic], int, int | None]] = {
     "bayer_bggr8": (np.uint8, 1, cv2.COLOR_BayerBGGR2RGB),
     "bayer_gbrg8": (np.uint8, 1, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": (np.uint8, 1, cv2.COLOR_BayerGRBG2RGB),
+    "bayer_rggb16": (np.uint16, 1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr16": (np.uint16, 1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg16": (np.uint16, 1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg16": (np.uint16, 1, cv2.COLOR_BayerGRBG2RGB),
+    "nv12": (np.uint8, 1, cv2.COLOR_YUV2RGB_NV12),
+    "nv21": (np.uint8, 1, cv2.COLOR_YUV2RGB_NV21),
 }
+#: Brightness of all pixels, and below it colour of each two by two, in half as many rows.
+_SEMI_PLANAR = ("nv12", "nv21")
+#: Of two pixels next to each other.
+_PAIRED = ("yuv422", "uyvy", "yuv422_yuy2", "yuyv", *_SEMI_PLANAR)
 _DEPTHS: dict[str, type[np.generic]] = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
+#: Names of images without distortion, while their CameraInfo is that of the lens, as those of image_proc. What a
+#: RealSense calls image_rect_raw is as its CameraInfo says.
+_RECTIFIED = re.compile(r"(^|[/_])rect(ified)?(?!_raw)([/_]|$)")
 #: dtype and channels by encoding.
 LAYOUTS = {name: (dtype, channels) for name, (dtype, channels, _) in _COLORS.items()} | {
     name: (dtype, 1) for name, dtype in _DEPTHS.items()
@@ -57,6 +72,8 @@ LAYOUTS = {name: (dtype, channels) for name, (dtype, channels, _) in _COLORS.ite
 def image_to_array(message: Image) -> NDArray[np.generic]:
     """View an image as an array (height, width) or (height, width, channels), dtype by encoding; not a copy.
 
+    One whose colour is in a plane of its own, such as nv12, is (3/2 height, width).
+
     Raises:
         OpenArmError: BAD_IMAGE, when the encoding is unknown or the data do not have the size that the header says.
     """
@@ -65,14 +82,20 @@ def image_to_array(message: Image) -> NDArray[np.generic]:
     dtype, channels = LAYOUTS[message.encoding]
     size = np.dtype(dtype).itemsize
     row = message.width * channels * size
-    if message.height == 0 or row == 0 or message.step < row or len(message.data) != message.step * message.height:
+    planar = message.encoding in _SEMI_PLANAR
+    height = message.height + (message.height // 2 if planar else 0)
+    if message.height == 0 or row == 0 or message.step < row or len(message.data) != message.step * height:
         raise _bad_image(
             f"image {message.width}×{message.height} {message.encoding} has step {message.step} and {len(message.data)}"
-            f" bytes, expected step >= {row} and step × height bytes"
+            f" bytes, expected step >= {row} and step × {'3/2 ' if planar else ''}height bytes"
         )
-    rows = np.frombuffer(message.data, dtype=np.uint8).reshape(message.height, message.step)[:, :row]
+    if message.encoding in _PAIRED and (message.width % 2 or (planar and message.height % 2)):
+        raise _bad_image(
+            f"image {message.encoding} is {message.width}×{message.height} pixels, expected an even number"
+        )
+    rows = np.frombuffer(message.data, dtype=np.uint8).reshape(height, message.step)[:, :row]
     pixels = rows if rows.flags.c_contiguous else np.ascontiguousarray(rows)
-    shape = (message.height, message.width, channels) if channels > 1 else (message.height, message.width)
+    shape = (height, message.width, channels) if channels > 1 else (height, message.width)
     if size > 1 and bool(message.is_bigendian) != (sys.byteorder == "big"):
         return pixels.view(np.dtype(dtype).newbyteorder()).astype(dtype).reshape(shape)
     return pixels.view(dtype).reshape(shape)
@@ -94,6 +117,7 @@ def array_to_image(pixels: NDArray[np.generic], encoding: str, frame_id: str, t_
     if pixels.dtype != dtype or (pixels.shape[2] if pixels.ndim == 3 else 1) != channels:
         raise _bad_image(f"{encoding} needs {channels} × {dtype.__name__}, got {pixels.dtype} {pixels.shape}")
     height, width = pixels.shape[:2]
+    height = height * 2 // 3 if encoding in _SEMI_PLANAR else height
     message = Image(header=header(frame_id, t_ns), height=height, width=width, encoding=encoding)
     message.is_bigendian = int(sys.byteorder == "big")
     message.step = width * channels * pixels.itemsize
@@ -117,8 +141,6 @@ def rgb_image(message: AnyImage) -> Bytes:
     _, _, code = _COLORS[message.encoding]
     if code is None:
         return to_bytes(pixels)
-    if message.width % 2 and code in (cv2.COLOR_YUV2RGB_UYVY, cv2.COLOR_YUV2RGB_YUY2):
-        raise _bad_image(f"image {message.encoding} is {message.width} pixels wide, expected an even number")
     return _bytes(cv2.cvtColor(to_bytes(pixels), code))
 
 
@@ -164,53 +186,80 @@ def _bytes(picture: NDArray[Any]) -> Bytes:
     return picture.astype(np.uint8, copy=False)
 
 
+def is_rectified(topic: str) -> bool:
+    """Whether the images of a topic have no distortion, by its name, whatever their CameraInfo says of the lens."""
+    return _RECTIFIED.search(topic) is not None
+
+
 def lens_from_info(info: CameraInfo, *, rectified: bool = False) -> Lens:
-    """Read intrinsics and distortion.
+    """Read intrinsics and distortion; the same lens for the same contents.
+
+    R, which turns rays of the lens into the frame of its rectified images, is no part of it: see `rotation_from_info`.
 
     Args:
-        info: Of the camera.
+        info: CameraInfo of the camera.
         rectified: Whether its images are rectified, as those of image_proc's `image_rect` are: by P then, not by K.
 
     Raises:
         OpenArmError: BAD_IMAGE, when the camera is not calibrated (K is zero), or has another distortion model.
     """
-    where, p = f"camera_info of {info.header.frame_id!r}", info.p
     size = (
         (info.roi.width or info.width) // max(info.binning_x, 1),
         (info.roi.height or info.height) // max(info.binning_y, 1),
     )
-    if rectified and p[0] > 0.0:
-        return lens_of(size, _in_part((p[0], 0.0, p[2], 0.0, p[5], p[6], 0.0, 0.0, 1.0), info), "", (), where)
-    return lens_of(size, _in_part(list(info.k), info), info.distortion_model, list(info.d), where)
+    where = f"camera_info of {info.header.frame_id!r}"
+    if rectified and info.p[0] > 0.0:
+        return _lens(size, tuple(projection_from_info(info)[:, :3].ravel().tolist()), "", (), where)
+    return _lens(size, tuple(_in_part(info.k, info).ravel().tolist()), info.distortion_model, tuple(info.d), where)
 
 
-def _in_part(k: Sequence[float], info: CameraInfo) -> list[float]:
-    """Return K of the images that binning and region of interest leave of the full resolution, as REP 104 has it."""
+_lens = lru_cache(maxsize=32)(lens_of)
+
+
+def projection_from_info(info: CameraInfo) -> Array:
+    """Return P (3, 4) of the rectified images."""
+    return _in_part(info.p, info)
+
+
+def rotation_from_info(info: CameraInfo) -> Array:
+    """Return R (3, 3), from the frame of the lens to that of its rectified images; where it has none, no rotation.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, when it is no rotation.
+    """
+    R = np.array(info.r, np.float64).reshape(3, 3)
+    if not R.any():
+        return np.eye(3)
+    if not np.abs(R @ R.T - np.eye(3)).max() < 1e-3:
+        raise _bad_image(f"R in the camera_info of {info.header.frame_id!r} is no rotation; calibrate it again")
+    return R
+
+
+def _in_part(matrix: Sequence[float], info: CameraInfo) -> Array:
+    """Return K or P of the images that binning and region of interest leave of the full resolution, as of REP 104."""
     across, down = max(info.binning_x, 1), max(info.binning_y, 1)
     scale = np.array([[1.0 / across, 0.0, -info.roi.x_offset / across], [0.0, 1.0 / down, -info.roi.y_offset / down]])
-    out = np.array(k, np.float64).reshape(3, 3)
-    out[:2] = scale[:, :2] @ out[:2] + scale[:, 2:] * out[2]
-    return out.ravel().tolist()
+    out = np.array(matrix, np.float64).reshape(3, -1)
+    out[:2] = scale @ out
+    return out
 
 
-def depth_of(depth: AnyImage, info: CameraInfo) -> tuple[NDArray[np.uint16] | Floats, Lens]:
-    """Return a depth image without distortion, in counts of its encoding, and its lens.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, as `depth_image` and `lens_from_info`, or when they do not belong together.
-    """
-    lens = lens_from_info(info)
-    return lens.rectified_depth(depth_image(depth)), lens
-
-
-def color_of(color: AnyImage, info: CameraInfo) -> tuple[Bytes, Lens]:
-    """Return a colour image (h, w, 3) without distortion, and its lens.
+def depth_of(depth: AnyImage, lens: Lens) -> NDArray[np.uint16] | Floats:
+    """Return a depth image without distortion, in counts of its encoding.
 
     Raises:
-        OpenArmError: BAD_IMAGE, as `rgb_image` and `lens_from_info`, or when they do not belong together.
+        OpenArmError: BAD_IMAGE, as `depth_image`, or when it is of another size than the lens.
     """
-    lens = lens_from_info(info)
-    return lens.rectified(rgb_image(color)), lens
+    return lens.rectified_depth(depth_image(depth))
+
+
+def color_of(color: AnyImage, lens: Lens) -> Bytes:
+    """Return a colour image (h, w, 3) without distortion.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, as `rgb_image`, or when it is of another size than the lens.
+    """
+    return lens.rectified(rgb_image(color))
 
 
 def _bad_image(message: str) -> OpenArmError:

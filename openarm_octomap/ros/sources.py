@@ -16,7 +16,7 @@ from openarm_common.errors import OpenArmError
 from openarm_common.robot.posture import JointNeed
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import points_from_cloud
-from openarm_common.ros.images import depth_of
+from openarm_common.ros.images import depth_of, is_rectified, lens_from_info
 from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
 from openarm_octomap.grid import CloudScan, DepthScan
@@ -116,9 +116,11 @@ def depth_source(
         topics: `depth` and `info`, with {camera} for its name.
         joints: Whether the joints are needed, to cut the robot out.
     """
+    rectified = is_rectified(topics["depth"])
 
     def to_scan(frame: Frame[Any]) -> DepthScan:
-        depth, lens = depth_of(frame.items["depth"], frame.items["info"])
+        lens = lens_from_info(frame.items["info"], rectified=rectified)
+        depth = depth_of(frame.items["depth"], lens)
         return DepthScan(depth, lens.intrinsics, frame.posture.T_base_frame, camera.near, camera.far)
 
     inputs = camera_topics(camera.name, **topics)

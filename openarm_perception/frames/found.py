@@ -24,8 +24,8 @@ from openarm_perception.segmentation.draw import depth_picture, label_picture, o
 #: Points that are asked whether they lie below the support, and so deep, m.
 _ASKED, _BELOW = 20_000, 0.02
 #: Metres of a count of depth by other sensors, of integers; and of floats that are no metres.
-_UNITS = {0.0001: "D405", 0.0002: "TUM's 5000 a metre", 0.00025: "L515"}
-_OF_FLOATS = {0.001: "millimetres"}
+_UNITS = {0.0001: "D405", 0.0002: "TUM's 5000 a metre", 0.00025: "L515", 0.01: "centimetres"}
+_OF_FLOATS = {0.001: "millimetres", 0.01: "centimetres"}
 #: Table tops are seen from within these, m.
 _NEAR, _FAR = 0.15, 1.5
 #: A thing has a colour when so many of its pixels have it.
@@ -73,7 +73,7 @@ class Found:
         return float(first), float(last)
 
     def unit_hint(self) -> str:
-        """Say which other unit of depth would fit, where it is far for a table top; "" where it is not."""
+        """Say which other unit of depth would fit, where it is far or near for a table top; "" where it is not."""
         return _other_units(self.frame.points[..., 2], self.frame.assumed)
 
     def as_json(self) -> dict[str, Any]:
@@ -213,7 +213,7 @@ def _other_units(z: NDArray[np.float32], count: float | None) -> str:
         count: Metres of a count that were assumed; None where that is known.
     """
     there = z[np.isfinite(z)]
-    if count is None or not there.size or (middle := float(np.median(there))) <= _FAR:
+    if count is None or not there.size or _NEAR <= (middle := float(np.median(there))) <= _FAR:
         return ""
     fit = [
         f"--depth-scale {unit:g} ({whose}) makes it {middle * unit / count:.2g} m"

@@ -13,17 +13,20 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.camera.depth_view import DepthImage, unit_scale
+from openarm_common.camera.depth_view import DepthImage, check_size, unit_scale
 from openarm_common.camera.lens import Lens
 from openarm_common.camera.lens_files import read_lens
 from openarm_common.camera.pictures import decode_picture, to_bytes
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array, Bytes, Floats
 from openarm_perception.frames.cloud_fields import MOST_POINTS
+from openarm_perception.frames.plain import read_array
 from openarm_perception.geometry.depth import Deprojector, DepthLimits, Points
 
 #: Most bytes of a file with an image, and of one with numbers.
 _MOST_BYTES, _MOST_TEXT = 256_000_000, 100_000
+#: Cameras are not further from the origin along any axis, m.
+_FARTHEST = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +37,15 @@ class Frame:
         points: (h, w, 3) float32 organised, optical frame, m; NaN where nothing was measured.
         rgb: (h, w, 3) uint8; None without colour.
         intrinsics: Of both.
-        assumed: Metres of a count of depth, where nobody has said it; None where that is known.
+        assumed: Metres of a count of depth, where it is not said; None where that is known.
+        lens: Lens of the depth image; None where points are of something else.
     """
 
     points: Points
     rgb: Bytes | None
     intrinsics: Intrinsics
     assumed: float | None = None
+    lens: Lens | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -70,14 +75,15 @@ def read_frame(color: Path, depth: Path, info: Path, depth_scale: float | None, 
     lens = read_lens(info, (rgb.shape[1], rgb.shape[0]))
     z = _read_counts(depth, lens)
     points = _organised(z, lens, depth_scale, limits)
-    return Frame(points, lens.rectified(rgb.astype(np.uint8, copy=False)), lens.intrinsics, assumed(z, depth_scale))
+    rgb = lens.rectified(rgb.astype(np.uint8, copy=False))
+    return Frame(points, rgb, lens.intrinsics, assumed(z, depth_scale), lens)
 
 
 def read_depth(path: Path, lens: Lens, depth_scale: float | None, limits: DepthLimits) -> Points:
     """Read a depth image as organised points, without distortion.
 
     Args:
-        path: Image with one channel of 16 bits, 0 where nothing was measured, or of floats (TIFF).
+        path: Image with one channel of 16 bits, 0 where nothing was measured, or of floats (TIFF); or such a .npy.
         lens: Lens of the camera.
         depth_scale: Metres of a count; None as for `metres`.
         limits: Depths that count.
@@ -92,12 +98,25 @@ def _organised(counts: DepthImage, lens: Lens, depth_scale: float | None, limits
     return Deprojector(limits).organised(lens.rectified_depth(metres(counts, depth_scale)), lens.intrinsics)
 
 
+def is_depth(path: Path) -> bool:
+    """Whether an array in a file is a depth image (h, w), and no cloud (n, 3) or (n, 6)."""
+    if path.suffix != ".npy":
+        return False
+    shape = read_array(path, "a cloud or a depth image").shape
+    return len(shape) == 2 and shape[1] > 6
+
+
 def _read_counts(path: Path, lens: Lens) -> DepthImage:
-    z, k = _read_image(path), lens.intrinsics
+    expected = "a depth image: one channel of 16 bits, or of floats"
+    if path.suffix == ".npy":
+        expected += "; (h, w), such as depth.astype(numpy.uint16)"
+        z = _checked_size(read_array(path, expected), path)
+        z = z.astype(np.float32 if z.dtype.kind == "f" else z.dtype.newbyteorder("="))
+    else:
+        z = _read_image(path)
     if z.dtype.name not in ("uint16", "float32") or z.ndim != 2:
-        raise _refused(path, f"has {_channels(z)}", "a depth image: one channel of 16 bits, or of floats")
-    if z.shape != (k.height, k.width):
-        raise _refused(path, f"is {z.shape[1]}x{z.shape[0]} pixels", f"{k.width}x{k.height}, as the colour image")
+        raise _refused(path, f"has {_channels(z)}", expected)
+    check_size(str(path), z.shape, lens.intrinsics)
     return z
 
 
@@ -136,8 +155,16 @@ def read_pose(path: Path) -> Array:
     # printed with few digits a rotation is none to the last one
     u, _, vt = np.linalg.svd(matrix[:3, :3])
     pose = se3.make(u @ vt, matrix[:3, 3])
-    if not np.allclose(pose, matrix, atol=1e-3) or np.linalg.det(u @ vt) < 0.0 or np.abs(pose[:3, 3]).max() > 1e3:
+    if not np.allclose(pose, matrix, atol=1e-3) or np.linalg.det(u @ vt) < 0.0:
         raise _refused(path, "has a matrix that is no pose", expected)
+    if np.abs(p := pose[:3, 3]).max() > _FARTHEST:
+        said, mm = (" ".join(f"{v:.6g}" for v in values) for values in (p, p / 1e3))
+        raise _refused(
+            path,
+            f"has a translation of {said}",
+            f"metres, {_FARTHEST:g} at most from the origin of a frame; where that is millimetres, write {mm} as its"
+            " last column",
+        )
     return pose
 
 
@@ -148,6 +175,10 @@ def _read_image(path: Path) -> NDArray[Any]:
         picture = decode_picture(path.read_bytes(), str(path))
     except OSError as error:
         raise _refused(path, f"can't be read: {error.strerror or error}", "a PNG file") from error
+    return _checked_size(picture, path)
+
+
+def _checked_size(picture: NDArray[Any], path: Path) -> NDArray[Any]:
     height, width = picture.shape[:2]
     if width * height > MOST_POINTS or min(width, height) < 8:
         raise _refused(path, f"is {width}x{height} pixels", f"8x8 to {MOST_POINTS} pixels")
@@ -155,7 +186,7 @@ def _read_image(path: Path) -> NDArray[Any]:
 
 
 def _channels(image: Any) -> str:
-    return f"{1 if image.ndim == 2 else image.shape[2]} channel(s) of {8 * image.dtype.itemsize} bits"
+    return f"{1 if image.ndim == 2 else image.shape[2]} channel(s) of {image.dtype.name}"
 
 
 def _read_text(path: Path) -> str:

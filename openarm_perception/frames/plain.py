@@ -6,9 +6,10 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from openarm_perception.frames.cloud_fields import MOST_POINTS, Cloud, cloud_of, refused
 
@@ -17,8 +18,12 @@ _MOST_TEXT = 1_000_000_000
 _COLUMNS = "x, y, z, and red, green, blue of 0 to 255 where there are six"
 
 
-def read_npy(path: Path) -> Cloud:
-    """Read a cloud: an array (n, k) or, organised, (h, w, k), of x, y, z and perhaps red, green, blue.
+def read_array(path: Path, expected: str) -> NDArray[Any]:
+    """Map an array of numbers of two or three dimensions.
+
+    Args:
+        path: Path of a .npy file.
+        expected: What it should have, for the error.
 
     Raises:
         OpenArmError: BAD_IMAGE, for another file.
@@ -29,8 +34,17 @@ def read_npy(path: Path) -> Cloud:
         raise refused(path, "is no array of numbers, or is cut short", "a .npy file of numpy.save") from error
     shape = getattr(array, "shape", ())
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or len(shape) not in (2, 3):
-        raise refused(path, f"has an array {shape}", f"numbers (n, 3), (n, 6), (h, w, 3) or (h, w, 6): {_COLUMNS}")
-    return _cloud(array, path)
+        raise refused(path, f"has an array {shape}", expected)
+    return cast("NDArray[Any]", array)
+
+
+def read_npy(path: Path) -> Cloud:
+    """Read a cloud: an array (n, k) or, organised, (h, w, k), of x, y, z and perhaps red, green, blue.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, for another file.
+    """
+    return _cloud(read_array(path, f"numbers (n, 3), (n, 6), (h, w, 3) or (h, w, 6): {_COLUMNS}"), path)
 
 
 def read_xyz(path: Path) -> Cloud:

@@ -12,8 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import PointCloud2
 
 from openarm_common.camera.cameras import depth_camera
 from openarm_common.camera.depth_view import DepthView
@@ -21,7 +20,7 @@ from openarm_common.camera.stream import Frame
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import cloud_from_points
-from openarm_common.ros.images import AnyImage, color_of, depth_of
+from openarm_common.ros.images import color_of, depth_of, is_rectified, lens_from_info
 from openarm_common.ros.node import QOS_SENSOR, BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_perception.config import CloudNodeConfig
@@ -79,8 +78,9 @@ class _Camera:
     def _take(self, frame: Frame[Any]) -> None:
         try:
             started = time.perf_counter()
-            depth, lens = depth_of(frame.items["depth"], frame.items["info"])
-            pixels, intrinsics = self._node.filter.depth(depth), lens.intrinsics
+            lens = lens_from_info(frame.items["info"], rectified=is_rectified(self._node.config.depth_topic))
+            depth, intrinsics = depth_of(frame.items["depth"], lens), lens.intrinsics
+            pixels = self._node.filter.depth(depth)
             if self._finder is not None:
                 limits = self._deprojector.limits
                 view = DepthView(pixels, intrinsics, frame.posture.T_base_frame, limits.near, limits.far)
@@ -108,16 +108,6 @@ class _Camera:
         removed = {f"{name}_removed/{link}": n for link, n in self._removed.items()}
         given_up = {f"{name}_{key}": n for key, n in self.stream.frames.given_up().items()}
         return {f"{name}_frames": self._frames, f"{name}_ms": f"{self._elapsed_ms:.2f}", **given_up, **removed}
-
-
-def _colors(message: AnyImage, info: CameraInfo, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    rgb, _ = color_of(message, info)
-    if rgb.shape[:2] != shape[:2]:
-        raise OpenArmError(
-            Code.BAD_IMAGE,
-            f"colour image is {rgb.shape[1]}x{rgb.shape[0]}; expected that of the depth, {shape[1]}x{shape[0]}",
-        )
-    return rgb
 
 
 class CloudNode(BaseNode[CloudNodeConfig]):
@@ -151,7 +141,10 @@ class CloudNode(BaseNode[CloudNodeConfig]):
     def _publisher(self, name: str) -> Callable[[Frame[Any], Points], None]:
         def publish(frame: Frame[Any], points: Points) -> None:
             points = self.filter.points(points)
-            rgb = _colors(frame.items["color"], frame.items["info"], points.shape) if "color" in frame.items else None
+            rgb = None
+            if "color" in frame.items:
+                lens = lens_from_info(frame.items["info"], rectified=is_rectified(self.config.color_topic))
+                rgb = color_of(frame.items["color"], lens)
             self._points[name].publish(cloud_from_points(points, frame.frame_id, frame.t_ns, rgb))
 
         return publish

@@ -28,7 +28,7 @@ from openarm_common.robot.posture import JointNeed, Posture
 from openarm_common.ros.answers import answering
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.detections import detections_to_msg
-from openarm_common.ros.images import array_to_image, color_of, depth_of, lens_from_info
+from openarm_common.ros.images import array_to_image, color_of, depth_of, is_rectified, lens_from_info
 from openarm_common.ros.labelled_clouds import labelled_cloud_to_msg
 from openarm_common.ros.node import QOS_LATCHED, QOS_SENSOR, BaseNode, reliable, run
 from openarm_common.ros.tf import RobotStateListener
@@ -177,11 +177,11 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         posture = frame.posture
         try:
             items = frame.items
-            rgb, lens = color_of(items["color"], items["info"])
-            intrinsics = lens.intrinsics
+            lens = lens_from_info(items["info"], rectified=is_rectified(self.config.color_topic))
+            rgb, intrinsics = color_of(items["color"], lens), lens.intrinsics
             depth = np.zeros(rgb.shape[:2], np.uint16)
             if "depth" in items:
-                depth, _ = depth_of(items["depth"], items["info"])
+                depth = depth_of(items["depth"], lens)
             started = time.perf_counter()
             robot = self._find_robot(depth, intrinsics, posture)
             self._newest = View(rgb, depth, intrinsics, posture.T_base_frame, robot)

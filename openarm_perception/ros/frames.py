@@ -6,15 +6,24 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from sensor_msgs.msg import CameraInfo
 
+from openarm_common import se3
 from openarm_common.camera.lens import Lens
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import stamp_to_ns
-from openarm_common.ros.images import AnyImage, depth_image, lens_from_info, rgb_image
+from openarm_common.ros.images import (
+    AnyImage,
+    color_of,
+    depth_image,
+    is_rectified,
+    lens_from_info,
+    rotation_from_info,
+)
 from openarm_common.types import Array
 from openarm_perception.frames.images import Frame, assumed, metres
 from openarm_perception.geometry.align import aligned
@@ -35,15 +44,42 @@ _DEPTH = (
 )  # fmt: skip
 #: What image_transport adds to a topic.
 _TRANSPORTS = ("", "/compressed", "/compressedDepth")
-#: Names of images without distortion, while their CameraInfo is that of the lens, as those of image_proc. What a
-#: RealSense calls image_rect_raw is as its CameraInfo says.
-_RECTIFIED = re.compile(r"(^|[/_])rect(ified)?(?!_raw)([/_]|$)")
 #: Names of depth that lies on the colour image already, whatever its frame is called.
 _REGISTERED = re.compile(r"registered|aligned_depth|depth_to_(color|rgb)")
 #: Colour and depth of one frame differ by no more: two images at 15 Hz that are not triggered together, ns.
 _TOGETHER = 35_000_000
 #: Intrinsics of the same image differ by no more, px.
 _SAME_PX = 0.5
+#: Frames that are tried, where the first ones can't be read.
+_FAULTS = 30
+
+
+@dataclass(frozen=True)
+class CameraChoice:
+    """Which camera, and what its topics and their names do not say.
+
+    Attributes:
+        camera: Namespace, such as `/camera/camera`, or a part of one; "": the only camera.
+        color: Topic of the colour image; "": by the names that drivers use.
+        depth: Topic of the depth image, likewise.
+        info: Topic of the CameraInfo of the colour image, likewise.
+        lens: Lens of the colour camera; None: by its CameraInfo.
+        depth_scale: Metres of a count of depth; None as for `metres`.
+        rectified: Whether the images are without distortion, whatever their CameraInfo says; None: by their names.
+        registered: Whether depth lies on the pixels of colour, whatever its frame is called; None: by its name.
+    """
+
+    camera: str = ""
+    color: str = ""
+    depth: str = ""
+    info: str = ""
+    lens: Lens | None = None
+    depth_scale: float | None = None
+    rectified: bool | None = None
+    registered: bool | None = None
+
+
+ONLY = CameraChoice()
 
 
 class CameraTopics(NamedTuple):
@@ -55,29 +91,20 @@ class CameraTopics(NamedTuple):
     depth_info: str = ""
 
 
-def camera_topics(
-    kinds: Mapping[str, str],
-    camera: str = "",
-    *,
-    color: str = "",
-    depth: str = "",
-    info: str = "",
-    known: bool = False,
-) -> CameraTopics:
+def camera_topics(kinds: Mapping[str, str], chosen: CameraChoice = ONLY, *, known: bool = False) -> CameraTopics:
     """Choose the topics of a camera among those that there are.
 
     Args:
         kinds: Type by topic.
-        camera: Namespace, such as `/camera/camera`, or a part of one; "": the only camera.
-        color: Topic of the colour image; "": by the names that drivers use.
-        depth: Topic of the depth image, likewise.
-        info: Topic of the CameraInfo of the colour image, likewise.
-        known: Whether the lens of the colour camera is known, so that no CameraInfo is needed.
+        chosen: Choice of the camera.
+        known: Whether no CameraInfo of the colour image is needed, as where its lens is given.
 
     Raises:
         OpenArmError: NOTHING_DETECTED, when there is no such camera; INVALID_ARGUMENT, when there are several, or a
             topic is missing or of another type.
     """
+    camera, color, depth, info = chosen.camera, chosen.color, chosen.depth, chosen.info
+    known = known or chosen.lens is not None
     for option, topic, types in (
         ("--color", color, (IMAGE, COMPRESSED)), ("--depth", depth, (IMAGE, COMPRESSED)), ("--info", info, (INFO,)),
     ):  # fmt: skip
@@ -163,21 +190,22 @@ class FrameBuilder:
     Args:
         topics: Topics of the camera.
         limits: Depths that count.
-        depth_scale: Metres of a count of depth; None is that of ROS: 0.001 of integers, 1 of floats.
-        lens: Lens of the colour camera; None: its CameraInfo says it.
+        chosen: What the topics do not say.
         pose: Returns the pose (4, 4) of the second frame in the first one; None, when it is not known.
+
+    Attributes:
+        faults: Why frames could not be read: later ones may be whole.
     """
 
     def __init__(
         self,
         topics: CameraTopics,
         limits: DepthLimits,
-        depth_scale: float | None = None,
-        lens: Lens | None = None,
+        chosen: CameraChoice = ONLY,
         pose: Callable[[str, str], Array | None] = lambda _target, _source: None,
     ) -> None:
-        self._topics, self._limits, self._scale, self._pose = topics, limits, depth_scale, pose
-        self._given = lens
+        self._topics, self._limits, self._chosen, self._pose = topics, limits, chosen, pose
+        self.faults: list[OpenArmError] = []
         self._newest: dict[str, Any] = {}
         self._nearest_ns = math.inf
 
@@ -199,7 +227,16 @@ class FrameBuilder:
         return self._frame(color, depth)
 
     def _wanted(self) -> list[str]:
-        return [topic for topic in self._topics if topic and (topic != self._topics.info or self._given is None)]
+        return [topic for topic in self._topics if topic and (topic != self._topics.info or self._chosen.lens is None)]
+
+    @property
+    def given_up(self) -> bool:
+        """Whether so many frames could not be read that another one will not be either."""
+        return len(self.faults) >= _FAULTS
+
+    def failure(self, code: Code, text: str) -> OpenArmError:
+        """Return why there is no frame: what was wrong with the first one, or a text with what has not come."""
+        return self.faults[0] if self.faults else OpenArmError(code, f"{text}: {self.missing()}")
 
     def missing(self) -> str:
         """What has not come, for an error."""
@@ -213,54 +250,75 @@ class FrameBuilder:
 
     def _frame(self, color: AnyImage, depth: AnyImage) -> Frame:
         """Make a frame: without distortion, and with the depth where the colour camera sees it."""
-        names = self._topics
-        lens = self._lens(names.info, self._given, _RECTIFIED.search(names.color) is not None)
-        rgb = lens.rectified(_fitting("colour", rgb_image(color), lens))
-        counts = depth_image(depth)
-        z = metres(counts, self._scale)
-        if own := names.depth_info:
-            raw = self._lens(own, None, False)
-            # depth that is registered to a rectified colour image has its CameraInfo, too
-            on_color = self._given is None and _alike(self._lens(names.info, None, False), raw)
-            plain = _RECTIFIED.search(names.depth) or (on_color and _RECTIFIED.search(names.color))
-            of_depth = self._lens(own, None, True) if plain else raw
-            registered = _alike(lens, of_depth) and _REGISTERED.search(names.depth)
-            T_color_depth = None if registered else self._between(color, depth)
-            z = of_depth.rectified_depth(_fitting("depth", z, of_depth))
-            if T_color_depth is not None or not _alike(lens, of_depth):
-                pose = np.eye(4) if T_color_depth is None else T_color_depth
-                z = aligned(z, of_depth.intrinsics, pose, lens.intrinsics)
-        else:
-            if _frame_id(depth) != _frame_id(color):
-                raise OpenArmError(
-                    Code.BAD_IMAGE,
-                    f"{self._topics.depth} is in frame {_frame_id(depth)!r}, {self._topics.color} in"
-                    f" {_frame_id(color)!r}, and the depth has no camera_info; {_ALIGN}",
-                )
-            z = lens.rectified_depth(_fitting("depth", z, lens))
+        names, chosen, counts = self._topics, self._chosen, depth_image(depth)
+        seen = _View(names.info, self._rectified(names.color))
+        lens = self._lens(seen)
+        registered = _REGISTERED.search(names.depth) is not None if chosen.registered is None else chosen.registered
+        info, as_color = names.depth_info, True
+        if not info or (registered and counts.shape == (lens.intrinsics.height, lens.intrinsics.width)):
+            info = names.info
+        else:  # depth on a rectified colour image has the CameraInfo of its lens, too
+            as_color = _alike(self._lens(_View(names.info, False)), self._lens(_View(info, False)))
+        measured = _View(info, self._rectified(names.depth) or (as_color and seen.rectified))
+        of_depth = self._lens(measured)
+        T_color_depth = np.eye(4) if registered else self._between(color, depth)
+        if measured != seen:
+            T_color_depth = se3.inverse(self._turned(seen)) @ T_color_depth @ self._turned(measured)
+        z = of_depth.rectified_depth(metres(counts, chosen.depth_scale))
+        on_color = np.allclose(T_color_depth, np.eye(4), atol=1e-6) and _alike(lens, of_depth)
+        if not on_color:
+            z = aligned(z, of_depth.intrinsics, T_color_depth, lens.intrinsics)
         points = Deprojector(self._limits).organised(z, lens.intrinsics)
-        return Frame(points, np.ascontiguousarray(rgb), lens.intrinsics, assumed(counts, self._scale))
+        rgb = np.ascontiguousarray(color_of(color, lens))
+        unit = assumed(counts, chosen.depth_scale)
+        return Frame(points, rgb, lens.intrinsics, unit, of_depth if on_color else None)
 
-    def _lens(self, info: str, given: Lens | None, rectified: bool) -> Lens:
-        """Return a lens: what is given, or by a CameraInfo."""
-        return given or lens_from_info(self._newest[info], rectified=rectified)
+    def _rectified(self, image: str) -> bool:
+        return is_rectified(image) if self._chosen.rectified is None else self._chosen.rectified
 
-    def _between(self, color: AnyImage, depth: AnyImage) -> Array | None:
-        """Return the pose of the depth's frame in that of colour; None where they are one."""
+    def _lens(self, view: _View) -> Lens:
+        """Return a lens: the given one of colour, or by a CameraInfo."""
+        given = self._chosen.lens
+        if given is not None and view.info == self._topics.info:
+            return Lens(given.intrinsics) if view.rectified else given
+        return lens_from_info(self._newest[view.info], rectified=view.rectified)
+
+    def _turned(self, view: _View) -> Array:
+        """Return the pose (4, 4) of the frame of these images in that of their message.
+
+        That is the frame of rectified images, as `image_geometry` has it; R turns it where the lens of a stereo pair is
+        turned.
+        """
+        if view.rectified or (self._chosen.lens is not None and view.info == self._topics.info):
+            return np.eye(4)
+        return se3.make(rotation_from_info(self._newest[view.info]))
+
+    def _between(self, color: AnyImage, depth: AnyImage) -> Array:
+        """Return the pose (4, 4) of the depth's frame in that of colour."""
         target, source = _frame_id(color), _frame_id(depth)
         if target == source or not (target and source):
-            return None
+            return np.eye(4)
+        where = f"{self._topics.depth} is in frame {source!r}, {self._topics.color} in {target!r}, and"
+        if not self._topics.depth_info:
+            raise OpenArmError(Code.BAD_IMAGE, f"{where} the depth has no camera_info; {_ALIGN}")
         pose = self._pose(target, source)
         if pose is None:
-            raise OpenArmError(
-                Code.NO_TRANSFORM,
-                f"{self._topics.depth} is in frame {source!r}, {self._topics.color} in {target!r}, and /tf_static does"
-                f" not tie them; {_ALIGN}, or record /tf_static, too",
-            )
-        return None if np.allclose(pose, np.eye(4), atol=1e-6) else pose
+            text = f"{where} /tf_static does not tie them; {_ALIGN}; or record /tf_static, too"
+            raise OpenArmError(Code.NO_TRANSFORM, text)
+        return pose
 
 
-_ALIGN = "take depth that the driver aligns with colour (RealSense: align_depth.enable:=true) by --depth"
+class _View(NamedTuple):
+    """Topic of the CameraInfo of images, and whether they are rectified."""
+
+    info: str
+    rectified: bool
+
+
+_ALIGN = (
+    "take depth that the driver aligns with colour (RealSense: align_depth.enable:=true) by --depth, or type"
+    " --registered where it lies on the pixels of colour already"
+)
 
 
 def _frame_id(message: Any) -> str:
@@ -272,19 +330,3 @@ def _alike(a: Lens, b: Lens) -> bool:
     return (one.width, one.height) == (other.width, other.height) and all(
         abs(getattr(one, name) - getattr(other, name)) < _SAME_PX for name in ("fx", "fy", "cx", "cy")
     )
-
-
-def _fitting(what: str, picture: Any, lens: Lens) -> Any:
-    """Return an image, which must have the size of its CameraInfo.
-
-    Raises:
-        OpenArmError: BAD_IMAGE.
-    """
-    k = lens.intrinsics
-    if picture.shape[:2] != (k.height, k.width):
-        raise OpenArmError(
-            Code.BAD_IMAGE,
-            f"the {what} image is {picture.shape[1]}x{picture.shape[0]} pixels, expected {k.width}x{k.height} of its"
-            " camera_info",
-        )
-    return picture

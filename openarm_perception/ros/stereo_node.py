@@ -19,16 +19,21 @@ from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, depth_camera, load_cameras, stereo_pairs
 from openarm_common.camera.depth_view import millimetres
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.printable import brief
 from openarm_common.ros.convert import info_from_intrinsics, stamp_to_ns
-from openarm_common.ros.images import array_to_image, rgb_image
+from openarm_common.ros.images import (
+    array_to_image,
+    lens_from_info,
+    projection_from_info,
+    rgb_image,
+    rotation_from_info,
+)
 from openarm_common.ros.node import QOS_NEWEST, QOS_SENSOR, BaseNode, run
 from openarm_common.types import Floats
 from openarm_perception.config import StereoNodeConfig
 from openarm_perception.geometry.depth import DepthLimits
 from openarm_perception.stereo.matching import StereoMatcher
 from openarm_perception.stereo.pairs import PairMatcher, Side
-from openarm_perception.stereo.rectification import Lens, Rectification, Rectified
+from openarm_perception.stereo.rectification import Rectification, Rectified
 
 #: A side that is silent for so long while the other comes is reported, s.
 _PATIENCE = 2.0
@@ -143,7 +148,7 @@ class StereoNode(BaseNode[StereoNodeConfig]):
         )
         if self._matcher is None or made_of != self._made_of:
             if self._T_left_right is not None:
-                lenses = _lens(left), _lens(right)
+                lenses = lens_from_info(left), lens_from_info(right)
                 rectification = Rectification.from_pose(*lenses, self._T_left_right)
             else:
                 ready = self.config.rectified
@@ -167,30 +172,14 @@ def _pair(config: StereoNodeConfig) -> tuple[CameraConfig, CameraConfig]:
     return depth_camera(config.camera), load_cameras()[pairs[config.camera]]
 
 
-def _lens(info: CameraInfo) -> Lens:
-    """Read the lens of a CameraInfo.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, when it is not calibrated or of an unknown model.
-    """
-    fisheye = info.distortion_model in ("equidistant", "fisheye")
-    if any(info.d) and not fisheye and info.distortion_model not in ("plumb_bob", "rational_polynomial"):
-        model = brief(info.distortion_model)
-        valid = "plumb_bob, rational_polynomial, equidistant"
-        raise OpenArmError(Code.BAD_IMAGE, f"distortion model {model} is not supported; valid: {valid}")
-    return Lens(info.width, info.height, np.array(info.k).reshape(3, 3), np.array(info.d, np.float64), fisheye)
-
-
 def _rectified(info: CameraInfo, ready: bool) -> Rectified:
     """Read how a camera is rectified; `ready`: its images are already.
 
     Raises:
-        OpenArmError: BAD_IMAGE, as `_lens`.
+        OpenArmError: BAD_IMAGE, as `lens_from_info` and `rotation_from_info`.
     """
-    P = np.array(info.p).reshape(3, 4)
-    if ready:
-        return Rectified(Lens(info.width, info.height, P[:, :3], np.zeros(5)), np.eye(3), P)
-    return Rectified(_lens(info), np.array(info.r).reshape(3, 3), P)
+    lens = lens_from_info(info, rectified=ready)
+    return Rectified(lens, np.eye(3) if ready else rotation_from_info(info), projection_from_info(info))
 
 
 def _share(depth: Floats) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import check_size
+from openarm_common.camera.lens import Lens
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array, Bytes
 
@@ -26,43 +27,6 @@ Map = NDArray[np.int16 | np.uint16]
 _SAME_PX = 1e-3
 #: Closer together, two cameras see no depth, m; further apart than this they are none of one robot's head.
 _BASELINES = (0.005, 2.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Lens:
-    """A camera as it is calibrated.
-
-    Attributes:
-        width: Pixels.
-        height: Pixels.
-        K: (3, 3), pixels.
-        D: Distortion (0, 4, 5, 8, 12 or 14), of the model `plumb_bob` or `rational_polynomial`; of `fisheye` (4).
-        fisheye: Whether D is of the model `equidistant`.
-    """
-
-    width: int
-    height: int
-    K: Array
-    D: Array
-    fisheye: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuse what is no calibration.
-
-        Raises:
-            OpenArmError: BAD_IMAGE, saying what is wrong.
-        """
-        K, lengths = self.K, (4,) if self.fisheye else (0, 4, 5, 8, 12, 14)
-        if fault := Intrinsics(self.width, self.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]).fault():
-            raise _no_pair(f"a camera is not calibrated: {fault}")
-        if len(self.D) not in lengths or not np.isfinite(self.D).all():
-            text = " or ".join(str(length) for length in lengths)
-            raise _no_pair(f"distortion {np.round(self.D, 4).tolist()[:16]}, expected {text} finite numbers")
-
-    @classmethod
-    def of(cls, intrinsics: Intrinsics) -> Self:
-        """Make the lens of a camera without distortion."""
-        return cls(intrinsics.width, intrinsics.height, intrinsics.matrix, np.zeros(5))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +45,11 @@ class Rectified:
 
     def maps(self) -> tuple[Map, Map] | None:
         """Return where each rectified pixel is found in the image, as `cv2.remap` takes it; None: where it is."""
-        lens, K = self.lens, self.P[:, :3]
-        if not lens.D.any() and np.allclose(self.R, np.eye(3), atol=1e-9) and np.allclose(K, lens.K, atol=1e-6):
+        K = self.P[:, :3]
+        unturned = np.allclose(self.R, np.eye(3), atol=1e-9)
+        if self.lens.straight and unturned and np.allclose(K, self.lens.intrinsics.matrix, atol=1e-6):
             return None
-        size = (lens.width, lens.height)
-        if lens.fisheye:
-            made = cv2.fisheye.initUndistortRectifyMap(lens.K, lens.D, self.R, K, size, cv2.CV_16SC2)
-        else:
-            made = cv2.initUndistortRectifyMap(lens.K, lens.D, self.R, K, size, cv2.CV_16SC2)
+        made = cv2.convertMaps(*self.lens.maps(self.R, K), cv2.CV_16SC2)
         return np.asarray(made[0], np.int16), np.asarray(made[1], np.uint16)
 
 
@@ -108,9 +69,9 @@ class Rectification:
     """
 
     def __init__(self, left: Rectified, right: Rectified) -> None:
-        size = (left.lens.width, left.lens.height)
-        if size != (right.lens.width, right.lens.height):
-            raise _no_pair(f"the right image is {right.lens.width}x{right.lens.height}, the left {size[0]}x{size[1]}")
+        size, other = ((k.width, k.height) for k in (left.lens.intrinsics, right.lens.intrinsics))
+        if size != other:
+            raise _no_pair(f"the right image is {other[0]}x{other[1]}, the left {size[0]}x{size[1]}")
         P = left.P
         self.intrinsics = Intrinsics(*size, *(float(v) for v in (P[0, 0], P[1, 1], P[0, 2], P[1, 2])))
         if fault := self.intrinsics.fault():
@@ -148,10 +109,12 @@ class Rectification:
         Raises:
             OpenArmError: BAD_IMAGE, when they do not make a pair that can be rectified.
         """
-        if left.fisheye != right.fisheye or (left.width, left.height) != (right.width, right.height):
+        size, other = ((k.width, k.height) for k in (left.intrinsics, right.intrinsics))
+        if left.fisheye != right.fisheye or size != other:
             raise _no_pair("one lens is a fisheye and the other is not, or their images differ in size")
         T_right_left = se3.inverse(T_left_right)
-        given = (left.K, left.D, right.K, right.D, (left.width, left.height), T_right_left[:3, :3], T_right_left[:3, 3])
+        optics = [part for lens in (left, right) for part in (lens.intrinsics.matrix, lens.d)]
+        given = (*optics, size, T_right_left[:3, :3], T_right_left[:3, 3])
         try:
             if left.fisheye:
                 found = cv2.fisheye.stereoRectify(*given, flags=cv2.CALIB_ZERO_DISPARITY)

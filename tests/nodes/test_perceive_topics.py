@@ -23,7 +23,15 @@ from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform
 from openarm_common.ros.images import array_to_image, image_to_array
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_perception.geometry.depth import DepthLimits
-from openarm_perception.ros.frames import COMPRESSED, IMAGE, INFO, FrameBuilder, camera_topics
+from openarm_perception.ros.frames import (
+    COMPRESSED,
+    IMAGE,
+    INFO,
+    CameraChoice,
+    CameraTopics,
+    FrameBuilder,
+    camera_topics,
+)
 from tests.refusals import refused
 
 pytestmark = pytest.mark.requirement("R-19")
@@ -54,7 +62,7 @@ KINDS = dict(zip(TOPICS, (IMAGE, IMAGE, INFO), strict=True))
 
 
 def frame_of(color, depth, info, limits: DepthLimits, scale: float | None = None):
-    builder = FrameBuilder(camera_topics(KINDS), limits, scale)
+    builder = FrameBuilder(camera_topics(KINDS), limits, CameraChoice(depth_scale=scale))
     return [builder.take(topic, message) for topic, message in zip(TOPICS, (color, depth, info), strict=True)][-1]
 
 
@@ -64,7 +72,7 @@ def check(data: dict[str, object], off: float = 0.005) -> None:
     assert one["size"] == pytest.approx([0.06, 0.08, 0.05], abs=off)  # a pixel
 
 
-def test_the_topics_of_a_running_camera_are_perceived(ros, tmp_path):
+def test_the_topics_of_a_running_camera_are_perceived_from_the_first_frame_that_can_be_read(ros, tmp_path):
     kinds = (Image, Image, CameraInfo)
     senders = [ros.node.create_publisher(kind, topic, 5) for kind, topic in zip(kinds, TOPICS, strict=True)]
     found = []
@@ -75,7 +83,10 @@ def test_the_topics_of_a_running_camera_are_perceived(ros, tmp_path):
     def ended() -> bool:
         nonlocal sent
         sent += 1
-        for sender, message in zip(senders, messages(sent * 33_000_000), strict=True):
+        frame = messages(sent * 33_000_000)
+        if sent < 5:
+            frame[0].encoding = "unknown"
+        for sender, message in zip(senders, frame, strict=True):
             sender.publish(message)
         return not thread.is_alive()
 
@@ -118,10 +129,10 @@ def test_a_bag_gives_the_first_frame_whose_images_are_of_the_same_time(bag):
 def test_cameras_are_chosen_by_their_namespace():
     two = {**KINDS, "/overhead/color/image_raw": IMAGE, "/overhead/color/camera_info": INFO}
     two["/overhead/depth/image_raw"] = IMAGE
-    assert camera_topics(two, "overhead").depth == "/overhead/depth/image_raw"
-    assert camera_topics(two, "/camera/camera")[:3] == TOPICS
+    assert camera_topics(two, CameraChoice("overhead")).depth == "/overhead/depth/image_raw"
+    assert camera_topics(two, CameraChoice("/camera/camera"))[:3] == TOPICS
     refused("several cameras: /camera/camera, /overhead", camera_topics, two)
-    chosen = camera_topics(two, "overhead", depth=TOPICS[1])
+    chosen = camera_topics(two, CameraChoice("overhead", depth=TOPICS[1]))
     assert chosen[:2] == ("/overhead/color/image_raw", TOPICS[1])
 
 
@@ -182,7 +193,7 @@ def write(path, by_topic) -> None:
 @pytest.mark.parametrize("away", [None, (0.05, -0.02, 0.0)])
 @pytest.mark.requirement("M-02")
 def test_depth_of_another_camera_is_aligned_or_refused(tmp_path, away):
-    """The depth camera has other intrinsics, and stands beside the colour camera; the box is where colour sees it."""
+    """The depth camera has other intrinsics, and stands next to the colour camera; the box is where colour sees it."""
     of_depth = Intrinsics(200, 140, 150.0, 150.0, 95.0, 72.0)
     x0, y0, _ = away or (0.0, 0.0, 0.0)
     v, u = np.mgrid[:140, :200]
@@ -229,6 +240,57 @@ def test_rectified_images_are_not_rectified_again(tmp_path, color, depth):
     infos = {f"{name.rpartition('/')[0]}/camera_info": info for name in names}
     write(tmp_path / "bag", {names[0]: rgb, names[1]: z, **infos})
     check(perceive(tmp_path / "bag", color=names[0], depth=names[1]).data)
+
+
+@pytest.mark.requirement("M-01", "M-02")
+def test_what_names_of_topics_do_not_say_is_said_by_options(tmp_path):
+    rgb, z, info = messages(0)
+    info.d, info.distortion_model = [0.3, -0.2, 0.0, 0.0, 0.0], "plumb_bob"
+    z.header.frame_id = "somewhere"
+    write(tmp_path / "bag", {"/c/color/image_raw": rgb, "/c/color/camera_info": info, "/c/depth/image_raw": z})
+    refused("or type --registered where it lies on the pixels of colour", perceive, tmp_path / "bag")
+    check(perceive(tmp_path / "bag", registered=True, rectified=True).data)
+    (one,) = perceive(tmp_path / "bag", registered=True).data["clusters"]
+    assert one["size"][1] < 0.078
+    write(tmp_path / "plain", {"/c/color/image_rect": rgb, "/c/color/camera_info": info, "/c/depth/image_raw": z})
+    (again,) = perceive(tmp_path / "plain", registered=True, rectified=False).data["clusters"]
+    assert again["size"] == one["size"]
+    refused("are for topics of a bag", perceive, tmp_path / "a.png", tmp_path / "a.png", rectified=True)
+
+
+@pytest.mark.requirement("M-02")
+def test_a_lens_of_a_file_is_that_of_depth_on_its_pixels_too(tmp_path):
+    """The CameraInfo of the depth, with the driver's intrinsics, does not move it to other pixels."""
+    color, depth, info = messages(0)
+    info.k[0] = info.k[4] = info.p[0] = info.p[5] = 150.0
+    topics = ("/c/color/image_raw", "/c/aligned_depth_to_color/image_raw", "/c/aligned_depth_to_color/camera_info")
+    write(tmp_path / "bag", dict(zip(topics, (color, depth, info), strict=True)))
+    write(tmp_path / "alone", dict(zip(topics[:2], (color, depth), strict=True)))
+    (tmp_path / "k.yaml").write_text(f"width: 160\nheight: 120\nk: {LENS.matrix.ravel().tolist()}\n")
+    found, alone = (perceive(tmp_path / name, info=str(tmp_path / "k.yaml")).data for name in ("bag", "alone"))
+    check(found)
+    assert found == alone
+
+
+@pytest.mark.requirement("M-01")
+def test_raw_colour_of_a_stereo_pair_meets_its_rectified_depth_by_the_rotation_of_camera_info():
+    """The pixels of colour are those of OpenCV, as `rectifyPoint` of image_geometry has them."""
+    color, depth, info = messages(0)
+    R = se3.exp_so3(np.array([0.02, -0.03, 0.05]))
+    info.r, info.d, info.distortion_model = R.ravel().tolist(), [-0.2, 0.05, 0.0, 0.0, 0.0], "plumb_bob"
+    pixels = np.stack(np.meshgrid(np.arange(160.0), np.arange(120.0)), axis=-1).reshape(-1, 1, 2)
+    straight = cv2.undistortPoints(pixels, LENS.matrix, np.array(info.d), R=R, P=LENS.matrix)
+    column, row = straight.reshape(120, 160, 2).astype(np.float32).transpose(2, 0, 1)
+    raw = cv2.remap(image_to_array(color), column, row, cv2.INTER_NEAREST)
+    topics = CameraTopics("/c/left/image_raw", "/c/left/depth_rect", "/c/left/camera_info")
+    builder = FrameBuilder(topics, DepthLimits())
+    assert builder.take(topics.color, array_to_image(raw, "rgb8", color.header.frame_id, 0)) is None
+    assert builder.take(topics.depth, depth) is None
+    found = builder.take(topics.info, info)
+    red = (found.rgb[..., 0] > 150) & (found.rgb[..., 1] < 100)
+    on = np.abs((found.points @ R.T)[..., 2] - (DISTANCE - HEIGHT)) < 0.01
+    assert np.count_nonzero(red) > 180
+    assert np.count_nonzero(red ^ on) < 0.12 * np.count_nonzero(red)  # the rim
 
 
 @pytest.mark.requirement("M-02")
@@ -295,7 +357,8 @@ def test_every_encoding_is_scaled_as_said():
 def test_what_does_not_belong_together_is_refused():
     color, depth, info = messages(0)
     info.width = 320
-    refused("160x120 pixels, expected 320x120", frame_of, color, depth, info, DepthLimits())
+    said = "depth image is 160x120 pixels, but its CameraInfo, .* says 320x120"
+    refused(said, frame_of, color, depth, info, DepthLimits())
     info.k = np.zeros(9)
     refused("is not calibrated", frame_of, color, depth, info, DepthLimits())
     builder = FrameBuilder(camera_topics(KINDS), DepthLimits())

@@ -16,8 +16,6 @@ from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
-from openarm_common.camera.lens import Lens
-from openarm_common.camera.lens_files import camera_info
 from openarm_common.robot.description import RobotDescription
 from tests.openarm_bringup.commands import answer_of, calibrate_fails
 from tests.openarm_calibration import foreign_files as files
@@ -73,9 +71,11 @@ def test_the_kind_that_a_file_of_easy_handeye2_states_is_used_and_a_missing_one_
 
 
 def info(path: Path, coefficients: np.ndarray | None = None) -> str:
-    model = "none" if coefficients is None else "rational_polynomial" if len(coefficients) == 8 else "plumb_bob"
-    lens = Lens(files.K, model, () if coefficients is None else tuple(float(c) for c in coefficients))
-    path.write_text(camera_info("cam", lens))
+    d = [] if coefficients is None else coefficients.tolist()
+    model = "rational_polynomial" if len(d) == 8 else "plumb_bob"
+    k = files.K
+    path.write_text(f"fx: {k.fx}\nfy: {k.fy}\ncx: {k.cx}\ncy: {k.cy}\nwidth: {k.width}\nheight: {k.height}\n"
+                    f"distortion_model: {model}\nd: {d}\n")  # fmt: skip
     return str(path)
 
 

@@ -15,21 +15,23 @@ from sensor_msgs.msg import CameraInfo
 
 from openarm_bringup.bags.bag import BagWriter
 from openarm_bringup.bags.ros.listener import from_profile
-from openarm_bringup.ros.camera_frame import CameraChoice, frame_of_bag
+from openarm_bringup.ros.camera_frame import frame_of_bag
 from openarm_calibration.board.board import parse_board
 from openarm_calibration.board.detect import detect_undistorted
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.lens import lens_of
-from openarm_common.camera.lens_files import camera_info, read_lens
+from openarm_common.camera.lens_files import read_lens
 from openarm_common.errors import Code
 from openarm_common.ros.convert import info_from_intrinsics
-from openarm_common.ros.images import array_to_image, color_of, depth_of
+from openarm_common.ros.images import array_to_image, color_of, depth_of, lens_from_info
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_hardware.cameras.config import UsbConfig
 from openarm_hardware.cameras.usb import UsbCamera
 from openarm_perception.frames.images import read_frame
 from openarm_perception.geometry.depth import DepthLimits
-from tests.lens_grid import MODELS, SIZE, STRAIGHT, K, drawn, librealsense, off, shown
+from openarm_perception.ros.frames import CameraChoice
+from openarm_perception.stereo.rectification import Rectification, Rectified
+from tests.lens_grid import MODELS, SIZE, STRAIGHT, K, calibration, drawn, librealsense, off, shown
 from tests.refusals import refused
 
 pytestmark = pytest.mark.requirement("M-01")
@@ -51,7 +53,7 @@ def lens(model: str):
 def by_files(model: str, rgb: NDArray[np.uint8], folder: Path) -> NDArray[np.uint8]:
     cv2.imwrite(str(folder / "c.png"), rgb)
     cv2.imwrite(str(folder / "z.png"), np.full(SIZE[::-1], 500, np.uint16))
-    (folder / "k.yaml").write_text(camera_info("c", lens(model)))
+    (folder / "k.yaml").write_text(calibration(model))
     frame = read_frame(folder / "c.png", folder / "z.png", folder / "k.yaml", None, DepthLimits())
     assert frame.rgb is not None
     return frame.rgb
@@ -70,12 +72,20 @@ def by_bag(model: str, rgb: NDArray[np.uint8], folder: Path) -> NDArray[np.uint8
 
 
 def by_topics(model: str, rgb: NDArray[np.uint8], _: Path) -> NDArray[np.uint8]:
-    return color_of(array_to_image(rgb, "rgb8", "c", 0), info_of(model))[0]
+    return color_of(array_to_image(rgb, "rgb8", "c", 0), lens_from_info(info_of(model)))
+
+
+def by_stereo(model: str, rgb: NDArray[np.uint8], _: Path) -> NDArray[np.uint8]:
+    left = np.hstack([K, np.zeros((3, 1))])
+    right = left.copy()
+    right[0, 3] = -0.06 * K[0, 0]
+    pair = (Rectified(lens_from_info(info_of(model)), np.eye(3), P) for P in (left, right))
+    return Rectification(*pair).rectify(rgb, rgb)[0]
 
 
 def by_usb(model: str, rgb: NDArray[np.uint8], folder: Path) -> NDArray[np.uint8]:
     cv2.imwrite(str(folder / "frame_00.png"), rgb)
-    (folder / "k.yaml").write_text(camera_info("c", lens(model)))
+    (folder / "k.yaml").write_text(calibration(model))
     camera = UsbCamera(
         UsbConfig.model_validate(
             {
@@ -93,7 +103,7 @@ def by_usb(model: str, rgb: NDArray[np.uint8], folder: Path) -> NDArray[np.uint8
     return frame.color
 
 
-@pytest.mark.parametrize("path", [by_files, by_bag, by_topics, by_usb])
+@pytest.mark.parametrize("path", [by_files, by_bag, by_topics, by_usb, by_stereo])
 @pytest.mark.parametrize("model", MODELS)
 def test_a_grid_is_where_a_camera_without_distortion_shows_it(
     model: str, path: Callable[[str, NDArray[np.uint8], Path], NDArray[np.uint8]], tmp_path: Path
@@ -109,10 +119,7 @@ def test_marks_of_a_board_are_moved_to_the_same_places(model: str) -> None:
 
 
 def test_the_pixels_of_librealsense_are_those_of_opencv() -> None:
-    found = librealsense("inverse_brown_conrady")
-    if found is None:
-        pytest.skip("the extra realsense is not installed")
-    rs, optics = found
+    rs, optics = librealsense("inverse_brown_conrady")
     grid = np.stack(np.meshgrid(np.linspace(0, 1279, 9), np.linspace(0, 719, 9)), axis=-1).reshape(-1, 2)
     points = np.array([rs.rs2_deproject_pixel_to_point(optics, list(pixel), 1.0) for pixel in grid])
     straight = points[:, :2] @ K[:2, :2] + K[:2, 2]
@@ -122,7 +129,7 @@ def test_the_pixels_of_librealsense_are_those_of_opencv() -> None:
 def test_depth_is_moved_like_colour_and_not_mixed() -> None:
     model = "plumb_bob"
     z = np.where(drawn(shown(model)) > 100, 700, 500).astype(np.uint16)
-    depth, _ = depth_of(array_to_image(z, "16UC1", "c", 0), info_of(model))
+    depth = depth_of(array_to_image(z, "16UC1", "c", 0), lens(model))
     assert set(np.unique(depth)) <= {0, 500, 700}
     assert off(np.where(depth == 700, 255, 0).astype(np.uint8)) < 1.0  # whole pixels
 

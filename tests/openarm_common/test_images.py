@@ -27,6 +27,7 @@ from openarm_common.ros.images import (
     image_to_array,
     lens_from_info,
     rgb_image,
+    rotation_from_info,
 )
 from tests.refusals import refused
 
@@ -35,7 +36,7 @@ from tests.refusals import refused
 def test_images_round_trip_without_loss(encoding: str) -> None:
     dtype, channels = LAYOUTS[encoding]
     rng = np.random.default_rng(0)
-    pixels = (rng.random((4, 6, channels) if channels > 1 else (4, 6)) * 200).astype(dtype)
+    pixels = (rng.random((6, 6, channels) if channels > 1 else (6, 6)) * 200).astype(dtype)
     message = array_to_image(pixels, encoding, "cam", 5)
     assert np.array_equal(image_to_array(message), pixels)
     assert message.header.frame_id == "cam"
@@ -94,6 +95,16 @@ def test_binning_and_region_leave_the_lens_of_the_images_that_come() -> None:
     info.binning_x = info.binning_y = 0
     info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = 200, 100, 240, 300
     assert lens_from_info(info).intrinsics == Intrinsics(240, 300, 600.0, 602.0, 118.0, 141.0)
+
+
+def test_the_rotation_of_a_stereo_pair_is_read() -> None:
+    info = info_from_intrinsics(Intrinsics.from_fovy(640, 480, 60.0), "c", 0)
+    info.r = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    assert rotation_from_info(info)[1, 0] == 1.0
+    info.r = [0.0] * 9
+    assert np.array_equal(rotation_from_info(info), np.eye(3))
+    info.r[0] = 2.0
+    refused("is no rotation", rotation_from_info, info)
 
 
 @pytest.mark.parametrize(("name", "ours"), [("Inverse Brown Conrady", "inverse_brown_conrady"), ("", "plumb_bob")])
@@ -158,10 +169,31 @@ def _chroma(r: int, g: int, b: int) -> tuple[int, int]:
     return round(128 - 0.148 * r - 0.291 * g + 0.439 * b), round(128 + 0.439 * r - 0.368 * g - 0.071 * b)
 
 
-@pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("encoding", ["nv12", "nv21"])
 @pytest.mark.requirement("M-08")
-def test_mosaics_are_colours(order: str) -> None:
-    rgb = rgb_image(array_to_image(bayer(order), f"bayer_{order}8", "c", 0))
+def test_colour_in_a_plane_of_its_own_is_colour(encoding: str) -> None:
+    """The planes are those of OpenCV's I420, with U and V in turns."""
+    rgb = np.zeros((8, 12, 3), np.uint8)
+    rgb[:, :6], rgb[4:, 6:] = (210, 40, 60), (20, 180, 90)
+    planar = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_I420)
+    u, v = planar[8:].reshape(2, 4, 6)
+    pairs = np.stack((u, v) if encoding == "nv12" else (v, u), axis=-1).reshape(4, 12)
+    message = array_to_image(np.vstack([planar[:8], pairs]), encoding, "c", 0)
+    assert (message.height, message.step, len(message.data)) == (8, 12, 144)
+    assert np.abs(rgb_image(message).astype(int) - rgb).max() <= 3
+    message.height = 7
+    refused("expected step >= 12 and step × 3/2 height bytes", rgb_image, message)
+    message.height, message.width, message.step = 9, 11, 11
+    message.data = bytes(11 * 13)
+    refused("even number", rgb_image, message)
+
+
+@pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.requirement("M-08")
+def test_mosaics_are_colours(order: str, bits: int) -> None:
+    pixels = bayer(order) if bits == 8 else bayer(order).astype(np.uint16) * 256 + 77
+    rgb = rgb_image(array_to_image(pixels, f"bayer_{order}{bits}", "c", 0))
     assert rgb[4, 4].tolist() == [200, 90, 30]
 
 

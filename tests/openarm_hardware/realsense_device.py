@@ -24,15 +24,22 @@ class SoftwareRealSense:
         coefficients: tuple[float, ...] = (0.0,) * 5,
         unit: float = 0.001,
         place: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        optics: Any = None,
     ) -> None:
+        """Make a device; `optics` are intrinsics of the library of both streams, depth's without distortion."""
         self.rs = rs = library()
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.name, "Software D435I")
         self.device.register_info(rs.camera_info.serial_number, serial)
         self._color, self._depth = (self.device.add_sensor(name) for name in ("Color", "Stereo"))
         self._motion = self.device.add_sensor("Motion")
-        self.color = self._video(self._color, rs.stream.color, 1, rs.format.rgb8, 3, COLOR_F, coefficients)
-        self.depth = self._video(self._depth, rs.stream.depth, 0, rs.format.z16, 2, DEPTH_F, (0.0,) * 5)
+        seen = optics or self._optics(COLOR_F, coefficients)
+        plain = self._optics(DEPTH_F, (0.0,) * 5)
+        if optics is not None:
+            for name in ("width", "height", "fx", "fy", "ppx", "ppy"):
+                setattr(plain, name, getattr(optics, name))
+        self.color = self._video(self._color, rs.stream.color, 1, rs.format.rgb8, 3, seen)
+        self.depth = self._video(self._depth, rs.stream.depth, 0, rs.format.z16, 2, plain)
         self._depth.add_read_only_option(rs.option.depth_units, unit)
         self.unit = unit
         # of the depth camera, from the colour camera
@@ -53,7 +60,7 @@ class SoftwareRealSense:
             frame = self.rs.software_video_frame()
             frame.pixels = np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
             frame.bpp = pixels.itemsize * (3 if pixels.ndim == 3 else 1)
-            frame.stride = WIDTH * frame.bpp
+            frame.stride = pixels.shape[1] * frame.bpp
             self._stamp(frame, profile, t_ns)
             if profile is self.depth:
                 frame.depth_units = self.unit
@@ -75,15 +82,18 @@ class SoftwareRealSense:
         frame.frame_number = self.number
         frame.profile = profile
 
-    def _video(self, sensor: Any, kind: Any, uid: int, form: Any, bpp: int, f: float, coefficients: Any) -> Any:
+    def _optics(self, f: float, coefficients: tuple[float, ...]) -> Any:
         rs = self.rs
         optics = rs.intrinsics()
         optics.width, optics.height, optics.fx, optics.fy = WIDTH, HEIGHT, f, f
         optics.ppx, optics.ppy = (WIDTH - 1) / 2.0, (HEIGHT - 1) / 2.0
         optics.model, optics.coeffs = rs.distortion.inverse_brown_conrady, list(coefficients)
-        stream = rs.video_stream()
+        return optics
+
+    def _video(self, sensor: Any, kind: Any, uid: int, form: Any, bpp: int, optics: Any) -> Any:
+        stream = self.rs.video_stream()
         stream.type, stream.index, stream.uid, stream.fmt, stream.bpp = kind, 0, uid, form, bpp
-        stream.width, stream.height, stream.fps, stream.intrinsics = WIDTH, HEIGHT, RATE, optics
+        stream.width, stream.height, stream.fps, stream.intrinsics = optics.width, optics.height, RATE, optics
         return sensor.add_video_stream(stream).as_video_stream_profile()
 
     def _axes(self, kind: Any, index: int) -> Any:

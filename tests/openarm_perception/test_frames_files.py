@@ -13,10 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.lens import Lens
 from openarm_common.errors import Code, OpenArmError
 from openarm_perception.frames.cloud_fields import Cloud
 from openarm_perception.frames.clouds import intrinsics_of
-from openarm_perception.frames.images import read_frame, read_pose
+from openarm_perception.frames.images import is_depth, read_depth, read_frame, read_pose
 from openarm_perception.frames.pcd import read_pcd, unpack_lzf, write_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 from tests.refusals import refused
@@ -134,6 +135,8 @@ def test_a_pose_is_a_pose(tmp_path):
     path = tmp_path / "pose"
     path.write_text("1 0 0 0.5\n0 -1 0 0\n0 0 -1 0.8\n0 0 0 1\n")
     assert read_pose(path)[:3, 3] == pytest.approx((0.5, 0.0, 0.8))
+    path.write_text("1 0 0 512\n0 -1 0 -30\n0 0 -1 820\n0 0 0 1\n")
+    refused("translation of 512 -30 820; .* where that is millimetres, write 0.512 -0.03 0.82 as its", read_pose, path)
     for text in (
         "1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n",
         "1 2 3 4\n" * 4,
@@ -186,3 +189,29 @@ def test_depth_of_floats_is_in_metres_or_in_what_is_said(tmp_path):
     files = (tmp_path / "c.png", tmp_path / "z.tiff", tmp_path / "k")
     assert read_frame(*files, 0.001, LIMITS).points[5, 7, 2] == pytest.approx(0.65425)
     assert read_frame(*files, None, DepthLimits(near=1.0, far=1000.0)).points[5, 7, 2] == pytest.approx(654.25)
+
+
+@pytest.mark.parametrize("kind", ["<u2", ">u2", "<f2", "<f4", ">f8"])
+@pytest.mark.requirement("M-02")
+def test_an_array_is_a_depth_image(tmp_path, kind):
+    z = np.full((12, 16), 0.75 if "f" in kind else 750, kind)
+    np.save(tmp_path / "z.npy", z)
+    assert is_depth(tmp_path / "z.npy")
+    assert read_depth(tmp_path / "z.npy", Lens(LENS), None, LIMITS)[5, 7, 2] == pytest.approx(0.75)
+    assert read_depth(tmp_path / "z.npy", Lens(LENS), 0.0005, DepthLimits(near=1e-5, far=5.0))[5, 7, 2] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("array", "said"),
+    [
+        (np.zeros((12, 16), np.int64), "1 channel.*int64; .* such as depth.astype"),
+        (np.zeros((12, 16, 3), np.uint16), "3 channel"),
+        (np.zeros((12, 15), np.uint16), "z.npy is 15x12 pixels, but .* says 16x12"),
+        (np.zeros((3, 2000, 2000), np.uint8), "pixels|channel"),
+        (np.zeros(12), "has an array"),
+        (np.array(["a"]), "has an array"),
+    ],
+)
+def test_other_arrays_are_no_depth_images(tmp_path, array, said):
+    np.save(tmp_path / "z.npy", array)
+    assert refused(said, read_depth, tmp_path / "z.npy", Lens(LENS), None, LIMITS).code is Code.BAD_IMAGE

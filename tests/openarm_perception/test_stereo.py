@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,10 +13,11 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.lens import Lens
 from openarm_perception.geometry.depth import DepthLimits
 from openarm_perception.stereo.matching import StereoConfig, StereoMatcher
 from openarm_perception.stereo.pairs import PairMatcher
-from openarm_perception.stereo.rectification import Lens, Rectification, Rectified
+from openarm_perception.stereo.rectification import Rectification, Rectified
 from tests.refusals import refused
 
 LENS = Intrinsics.from_fovy(320, 240, 52.0)
@@ -24,7 +27,7 @@ SIDE_BY_SIDE = se3.make(None, (BASELINE, 0.0, 0.0))
 
 
 def matcher(rectification: Rectification | None = None, **config: object) -> StereoMatcher:
-    rectification = rectification or Rectification.from_pose(Lens.of(LENS), Lens.of(LENS), SIDE_BY_SIDE)
+    rectification = rectification or Rectification.from_pose(Lens(LENS), Lens(LENS), SIDE_BY_SIDE)
     return StereoMatcher(StereoConfig(**config), rectification, LIMITS)
 
 
@@ -38,11 +41,11 @@ def seen(
     T_camera: np.ndarray, n: np.ndarray, d: float, lens: Lens, pattern: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The image (h, w, 3) that a camera takes of a textured plane n·p = d, and its depth (h, w), by ray casting."""
-    u, v = np.meshgrid(np.arange(lens.width, dtype=np.float64), np.arange(lens.height, dtype=np.float64))
+    k = lens.intrinsics
+    u, v = np.meshgrid(np.arange(k.width, dtype=np.float64), np.arange(k.height, dtype=np.float64))
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
-    rays = cv2.undistortPointsIter(pixels, lens.K, lens.D, None, None, (3, 100, 1e-12)).reshape(
-        lens.height, lens.width, 2
-    )
+    rays = cv2.undistortPointsIter(pixels, k.matrix, lens.d, None, None, (3, 100, 1e-12))
+    rays = rays.reshape(k.height, k.width, 2)
     rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
     R, p = T_camera[:3, :3], T_camera[:3, 3]
     z = (d - n @ p) / (rays @ R.T @ n)
@@ -60,8 +63,8 @@ NORMAL = np.array([0.15, -0.3, 1.0]) / np.linalg.norm([0.15, -0.3, 1.0])
 def test_depth_of_a_textured_plane_is_within_half_a_pixel(distance: float, a: float, b: float) -> None:
     """Nearly everywhere that both cameras see, at any slope."""
     n = np.array([a, b, 1.0]) / np.linalg.norm([a, b, 1.0])
-    left, true = seen(np.eye(4), n, distance, Lens.of(LENS), texture())
-    right, _ = seen(SIDE_BY_SIDE, n, distance, Lens.of(LENS), texture())
+    left, true = seen(np.eye(4), n, distance, Lens(LENS), texture())
+    right, _ = seen(SIDE_BY_SIDE, n, distance, Lens(LENS), texture())
     z = matcher().depth(left, right)
     valid = np.isfinite(z) & (true > LIMITS.near) & (true < LIMITS.far)
     error = LENS.fx * BASELINE * (1.0 / z - 1.0 / true)[valid]  # pixels of disparity
@@ -74,8 +77,8 @@ def test_depth_of_a_textured_plane_is_within_half_a_pixel(distance: float, a: fl
 def test_cameras_with_distortion_that_are_turned_against_each_other() -> None:
     """Depth is that of the rectified left camera, whose rotation `R` of the rectification is."""
     D = np.array([-0.12, 0.05, 0.001, -0.001, 0.0])
-    left_lens = Lens(320, 240, LENS.matrix + np.diag([3.0, 3.0, 0.0]), D)
-    right_lens = Lens(320, 240, LENS.matrix, 0.8 * D)
+    longer = replace(LENS, fx=LENS.fx + 3.0, fy=LENS.fy + 3.0)
+    left_lens, right_lens = Lens(longer, "plumb_bob", tuple(D)), Lens(LENS, "plumb_bob", tuple(0.8 * D))
     T = SIDE_BY_SIDE @ se3.make(se3.exp_so3(np.array([0.01, -0.02, 0.015])))
     rectification = Rectification.from_pose(left_lens, right_lens, T)
     assert rectification.baseline == pytest.approx(BASELINE)
@@ -85,7 +88,7 @@ def test_cameras_with_distortion_that_are_turned_against_each_other() -> None:
     z = matcher(rectification).depth(left, right)
     T_right_left = se3.inverse(T)
     R, *_ = cv2.stereoRectify(
-        left_lens.K, D, right_lens.K, 0.8 * D, (320, 240), T_right_left[:3, :3], T_right_left[:3, 3],
+        longer.matrix, D, LENS.matrix, 0.8 * D, (320, 240), T_right_left[:3, :3], T_right_left[:3, 3],
         flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
     )  # fmt: skip
     v, u = np.nonzero(np.isfinite(z))
@@ -99,8 +102,8 @@ def test_cameras_with_distortion_that_are_turned_against_each_other() -> None:
 def test_what_one_camera_alone_sees_has_no_depth() -> None:
     """Beside a near body before a wall; without the match back some of it has the depth of one of both."""
     near, far = texture(1), texture(2)
-    left, _ = seen(np.eye(4), np.array([0.0, 0.0, 1.0]), 1.2, Lens.of(LENS), far)
-    right, _ = seen(SIDE_BY_SIDE, np.array([0.0, 0.0, 1.0]), 1.2, Lens.of(LENS), far)
+    left, _ = seen(np.eye(4), np.array([0.0, 0.0, 1.0]), 1.2, Lens(LENS), far)
+    right, _ = seen(SIDE_BY_SIDE, np.array([0.0, 0.0, 1.0]), 1.2, Lens(LENS), far)
     d_near, d_far = (LENS.fx * BASELINE / z for z in (0.5, 1.2))
     shift = round(d_near)
     left[60:180, 140:220] = right[60:180, 140 - shift : 220 - shift] = near[:120, :80, None]
@@ -131,8 +134,8 @@ def test_stripes_along_the_rows_have_no_depth_where_texture_is_asked_for() -> No
 
 
 def test_depths_are_within_the_limits() -> None:
-    left, true = seen(np.eye(4), NORMAL, 0.25, Lens.of(LENS), texture())
-    right, _ = seen(SIDE_BY_SIDE, NORMAL, 0.25, Lens.of(LENS), texture())
+    left, true = seen(np.eye(4), NORMAL, 0.25, Lens(LENS), texture())
+    right, _ = seen(SIDE_BY_SIDE, NORMAL, 0.25, Lens(LENS), texture())
     z = matcher().depth(left, right)
     assert np.isfinite(z).any()
     assert true.min() < LIMITS.near - 0.02
@@ -140,15 +143,13 @@ def test_depths_are_within_the_limits() -> None:
 
 
 def test_a_pair_that_is_none_is_refused_with_the_reason() -> None:
-    lens, P = Lens.of(LENS), np.hstack([LENS.matrix, np.zeros((3, 1))])
+    lens, P = Lens(LENS), np.hstack([LENS.matrix, np.zeros((3, 1))])
     shifted = P.copy()
     shifted[0, 3] = LENS.fx * BASELINE
     other = P.copy()
     other[0, 0] += 5.0
     for right, said in ((P, "baseline is -?0 m"), (shifted, "exchanged"), (other, "expected the same")):
         refused(said, Rectification, Rectified(lens, np.eye(3), P), Rectified(lens, np.eye(3), right))
-    refused("not calibrated", Lens, 320, 240, np.zeros((3, 3)), np.zeros(5))
-    refused(r"distortion .* expected 0 or 4", Lens, 320, 240, LENS.matrix, np.full(5, np.nan))
     rectification = Rectification.from_pose(lens, lens, SIDE_BY_SIDE)
     refused("left image is 10x20", rectification.rectify, np.zeros((20, 10), np.uint8), np.zeros((240, 320), np.uint8))
     refused("raise `near`", StereoMatcher, StereoConfig(), rectification, DepthLimits(near=0.01, far=1.0))

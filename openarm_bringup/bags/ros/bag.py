@@ -27,7 +27,7 @@ from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import stamp_to_ns, transform_to_matrix
-from openarm_common.ros.images import AnyImage, color_of, depth_of, grey_image
+from openarm_common.ros.images import AnyImage, color_of, depth_of, grey_image, lens_from_info
 from openarm_common.ros.tf import table_height
 from openarm_common.scene.scene import load_scene
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
@@ -148,8 +148,8 @@ def _work(shot: _Shot, states: RobotStateBuffer, pipeline: Pipeline, mapper: Map
         raise OpenArmError(Code.BAD_IMAGE, "colour, depth or camera_info of a stamp is missing")
     T_base_camera = states.lookup(RobotDescription.load().base, shot.camera.optical_frame, shot.t_ns)
     joints = states.joints_at(shot.t_ns)
-    rgb, lens = color_of(shot.color, shot.info)
-    depth, _ = depth_of(shot.depth, shot.info)
+    lens = lens_from_info(shot.info)
+    rgb, depth = color_of(shot.color, lens), depth_of(shot.depth, lens)
     for located in pipeline.run(rgb, depth, lens.intrinsics, T_base_camera).located:
         found.objects[f"{shot.camera.name}/{located.label}"].append(located)
     scan = DepthScan(depth, lens.intrinsics, T_base_camera, shot.camera.near, shot.camera.far)

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -27,8 +26,8 @@ from openarm_common.config import read_text, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import stamp_to_ns, transform_to_matrix
-from openarm_common.ros.images import grey_image, lens_from_info
-from openarm_common.types import Array, Bytes
+from openarm_common.ros.images import grey_image, is_rectified, lens_from_info
+from openarm_common.types import Array
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO, _JOINTS, _TF = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState", "tf2_msgs/msg/TFMessage"
@@ -79,23 +78,12 @@ def samples_of_foreign(bag: Bag, board: Board, given: Foreign) -> tuple[SampleSe
         if picker.wants(t_ns):
             message = message_of(bag, record)
             try:
-                pixels = _grey(message, lens, images)
+                pixels = grey_image(message)
             except OpenArmError as error:
                 picker.refuse(t_ns, error)
             else:
                 picker.offer(t_ns, pixels, lens.intrinsics)
     return samples, found
-
-
-def _grey(message: Any, lens: Lens, topic: str) -> Bytes:
-    pixels = grey_image(message)
-    if pixels.shape != (lens.intrinsics.height, lens.intrinsics.width):
-        raise OpenArmError(
-            Code.BAD_IMAGE,
-            f"{topic} has {pixels.shape[1]}x{pixels.shape[0]} pixels, the intrinsics are of"
-            f" {lens.intrinsics.width}x{lens.intrinsics.height}",
-        )
-    return pixels
 
 
 def _topic(bag: Bag, option: str, name: str, kinds: Sequence[str], without: str = "") -> str:
@@ -127,7 +115,7 @@ def _lens(bag: Bag, images: str, given: Foreign) -> Lens:
     name = given.info_topic or next((t for t in near if bag.counts.get(t)), "")
     topic = _topic(bag, "info_topic", name, (_INFO,))
     info = messages_of(bag, (topic,))[topic][-1]
-    return lens_from_info(info)
+    return lens_from_info(info, rectified=is_rectified(images))
 
 
 def _of_joints(bag: Bag, given: Foreign) -> tuple[RobotDescription, list[State]]:

@@ -41,7 +41,7 @@ from openarm_common.ros.convert import (
     transform_to_matrix,
     xyz,
 )
-from openarm_common.ros.images import color_of, depth_of, rgb_image
+from openarm_common.ros.images import color_of, depth_of, lens_from_info, rgb_image
 from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF
 from openarm_common.ros.polled import Polled, Source
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
@@ -163,8 +163,9 @@ def _show_cloud(description: RobotDescription, camera: CameraConfig) -> Show:
         if depth is None or color is None or info is None or depth.header.stamp != color.header.stamp:
             return  # the other half of the frame comes soon
         T_base_optical = states.lookup(description.base, camera.optical_frame, stamp_to_ns(depth.header.stamp))
-        pixels, lens = depth_of(depth, info)
-        points, colors = wire.thin_cloud(deprojector, pixels, color_of(color, info)[0], lens.intrinsics, T_base_optical)
+        lens = lens_from_info(info)
+        pixels, rgb = depth_of(depth, lens), color_of(color, lens)
+        points, colors = wire.thin_cloud(deprojector, pixels, rgb, lens.intrinsics, T_base_optical)
         newest[0] = None  # shown
         yield "cloud", wire.frame({"kind": "cloud", "count": len(points)}, points, colors)
 
