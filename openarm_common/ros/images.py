@@ -240,7 +240,8 @@ def _in_part(matrix: Sequence[float], info: CameraInfo) -> Array:
     across, down = max(info.binning_x, 1), max(info.binning_y, 1)
     scale = np.array([[1.0 / across, 0.0, -info.roi.x_offset / across], [0.0, 1.0 / down, -info.roi.y_offset / down]])
     out = np.array(matrix, np.float64).reshape(3, -1)
-    out[:2] = scale @ out
+    with np.errstate(invalid="ignore"):
+        out[:2] = scale @ out
     return out
 
 

@@ -111,7 +111,8 @@ def _read_counts(path: Path, lens: Lens) -> DepthImage:
     if path.suffix == ".npy":
         expected += "; (h, w), such as depth.astype(numpy.uint16)"
         z = _checked_size(read_array(path, expected), path)
-        z = z.astype(np.float32 if z.dtype.kind == "f" else z.dtype.newbyteorder("="))
+        with np.errstate(over="ignore"):
+            z = z.astype(np.float32 if z.dtype.kind == "f" else z.dtype.newbyteorder("="))
     else:
         z = _read_image(path)
     if z.dtype.name not in ("uint16", "float32") or z.ndim != 2:

@@ -122,12 +122,13 @@ def camera_topics(kinds: Mapping[str, str], chosen: CameraChoice = ONLY, *, know
     lacking = [topics for topics in cameras.values() if not (topics.info or known)]
     cameras = {space: topics for space, topics in cameras.items() if topics.info or known}
     part = camera.strip("/")
-    chosen = [f"/{part}"] if f"/{part}" in cameras else [space for space in cameras if part in space]
-    if len({cameras[space] for space in chosen}) == 1:
-        return cameras[chosen[0]]
-    if chosen:
+    fitting = [f"/{part}"] if f"/{part}" in cameras else [space for space in cameras if part in space]
+    if len({cameras[space] for space in fitting}) == 1:
+        return cameras[fitting[0]]
+    if fitting:
         raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"several cameras: {', '.join(chosen)}; choose one by --camera, or topics by --color"
+            Code.INVALID_ARGUMENT,
+            f"several cameras: {', '.join(fitting)}; choose one by --camera, or topics by --color",
         )
     if lacking:
         _with_infos(lacking[0], kinds)  # says what is missing

@@ -113,8 +113,8 @@ class Rectification:
         if left.fisheye != right.fisheye or size != other:
             raise _no_pair("one lens is a fisheye and the other is not, or their images differ in size")
         T_right_left = se3.inverse(T_left_right)
-        optics = [part for lens in (left, right) for part in (lens.intrinsics.matrix, lens.d)]
-        given = (*optics, size, T_right_left[:3, :3], T_right_left[:3, 3])
+        K_left, K_right = left.intrinsics.matrix, right.intrinsics.matrix
+        given = (K_left, left.d, K_right, right.d, size, T_right_left[:3, :3], T_right_left[:3, 3])
         try:
             if left.fisheye:
                 found = cv2.fisheye.stereoRectify(*given, flags=cv2.CALIB_ZERO_DISPARITY)

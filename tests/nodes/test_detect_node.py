@@ -187,7 +187,7 @@ def test_images_are_subscribed_to_only_while_detections_have_a_subscriber(ros) -
 def test_what_does_not_fit_is_named_and_dropped(bench) -> None:
     """Encodings, sizes, frames, a CameraInfo without calibration; the next good frame is answered."""
     for text, stream, make in (
-        ("encoding 'nv21'", "color", _relabel),
+        ("encoding 'nv24'", "color", _relabel),
         ("valid: rgb8, bgr8", "color", lambda cam, t: array_to_image(cam.rgb[..., 0], "mono8", cam.frame, t)),
         (
             "depth image is 320x240",
@@ -211,7 +211,7 @@ def test_what_does_not_fit_is_named_and_dropped(bench) -> None:
 
 def _relabel(camera: FakeCamera, t_ns: int) -> Image:
     message = array_to_image(camera.rgb, "rgb8", camera.frame, t_ns)
-    message.encoding = "nv21"
+    message.encoding = "nv24"
     return message
 
 

@@ -245,8 +245,9 @@ def test_rectified_images_are_not_rectified_again(tmp_path, color, depth):
 @pytest.mark.requirement("M-01", "M-02")
 def test_what_names_of_topics_do_not_say_is_said_by_options(tmp_path):
     rgb, z, info = messages(0)
-    info.d, info.distortion_model = [0.3, -0.2, 0.0, 0.0, 0.0], "plumb_bob"
+    info.d, info.distortion_model = [20.0, 0.0, 0.0, 0.0, 0.0], "plumb_bob"
     z.header.frame_id = "somewhere"
+    (tmp_path / "k.png").touch()
     write(tmp_path / "bag", {"/c/color/image_raw": rgb, "/c/color/camera_info": info, "/c/depth/image_raw": z})
     refused("or type --registered where it lies on the pixels of colour", perceive, tmp_path / "bag")
     check(perceive(tmp_path / "bag", registered=True, rectified=True).data)
@@ -255,7 +256,7 @@ def test_what_names_of_topics_do_not_say_is_said_by_options(tmp_path):
     write(tmp_path / "plain", {"/c/color/image_rect": rgb, "/c/color/camera_info": info, "/c/depth/image_raw": z})
     (again,) = perceive(tmp_path / "plain", registered=True, rectified=False).data["clusters"]
     assert again["size"] == one["size"]
-    refused("are for topics of a bag", perceive, tmp_path / "a.png", tmp_path / "a.png", rectified=True)
+    refused("are for topics of a bag", perceive, tmp_path / "k.png", tmp_path / "k.png", rectified=True)
 
 
 @pytest.mark.requirement("M-02")

@@ -35,7 +35,7 @@ BOARD = "aprilgrid:5x4:30mm:0.3"
 LENS = np.array([0.2, -0.1, 0.001, -0.0005, 0.02, 0.35, -0.05, 0.01])
 TYPES = {
     "/eye/image/compressed": (CompressedImage, "sensor_msgs/msg/CompressedImage", QOS_SENSOR),
-    "/eye/image": (Image, "sensor_msgs/msg/Image", QOS_SENSOR),
+    "/eye/image_rect": (Image, "sensor_msgs/msg/Image", QOS_SENSOR),
     "/eye/camera_info": (CameraInfo, "sensor_msgs/msg/CameraInfo", QOS_SENSOR),
     "/joint_states": (JointState, "sensor_msgs/msg/JointState", QOS_COMMAND),
     "/tf": (TFMessage, "tf2_msgs/msg/TFMessage", QOS_COMMAND),
@@ -48,8 +48,7 @@ def record(path: Path, known: files.Truth, topics: tuple[str, ...], lens: np.nda
     """Write a bag of a robot `ur` that stands in places; between them nothing is recorded but one state in motion."""
     robot = robot_of_poses("ur_base", "ur_tool")
     info = info_from_intrinsics(files.K, "eye", 0)
-    if lens is not None:
-        info.distortion_model, info.d = "rational_polynomial", lens.tolist()
+    info.distortion_model, info.d = "rational_polynomial", LENS.tolist()  # also of images that are rectified
     t = 50_000 * MS
     with BagWriter(path, {}) as bag:
         for topic in topics:
@@ -83,7 +82,7 @@ def record(path: Path, known: files.Truth, topics: tuple[str, ...], lens: np.nda
                     packed = CompressedImage(format="png", data=cv2.imencode(".png", grey)[1].tobytes())
                     packed.header.stamp = info.header.stamp = stamp
                     write("/eye/image/compressed", packed)
-                    write("/eye/image", array_to_image(grey, "mono8", "eye", t))
+                    write("/eye/image_rect", array_to_image(grey, "mono8", "eye", t))
                     write("/eye/camera_info", info)
                 t += 10 * MS
             t += 2_000 * MS
@@ -124,8 +123,8 @@ def test_a_bag_of_another_robot_with_a_lens_is_solved_and_its_session_too(capsys
 
 @pytest.mark.requirement("P-28", "A-44")
 def test_a_bag_without_a_description_is_solved_by_tf(capsys, known, tmp_path: Path) -> None:
-    """A raw image, no distortion, a chain of a moving and a static frame."""
-    path = record(tmp_path / "bag", known, ("/eye/image", "/eye/camera_info", "/tf", "/tf_static"), None)
+    """A rectified image, whose CameraInfo has the distortion of the lens; a chain of a moving and a static frame."""
+    path = record(tmp_path / "bag", known, ("/eye/image_rect", "/eye/camera_info", "/tf", "/tf_static"), None)
     argv = ("--camera-kind", "eye_in_hand", "--base", "ur_base", "--tip", "ur_tool", "--board", BOARD)
     store = ("--store", str(tmp_path / "s"))
     code, data = answer_of(capsys, "calibrate", "import", str(path), *argv, "--joint-topic", "tf", *store)
