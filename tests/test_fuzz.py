@@ -59,6 +59,8 @@ _DOORS: list[tuple[type[Any], Callable[[Any], object]]] = [
     (CompressedImage, images.rgb_image),
     (CompressedImage, images.depth_image),
     (CameraInfo, images.lens_from_info),
+    (CameraInfo, images.rotation_from_info),
+    (CameraInfo, images.projection_from_info),
     (PointCloud2, convert.points_from_cloud),
     (JointTrajectory, convert.trajectory_from_msg),
     (MarkerArray, convert.held_from_msg),

@@ -40,7 +40,7 @@ class SqliteStorage:
         logs = (path.with_name(path.name + suffix) for suffix in ("-wal", "-journal"))
         logged = sum(log.stat().st_size for log in logs if log.exists())
         self._most_steps = _STEPS * (path.stat().st_size + logged) + 10 * _LOOK
-        # A file without a log beside it is read without any lock, which would need a folder that can be written.
+        # A file without a log next to it is read without any lock, which would need a folder that can be written.
         uri = f"{path.resolve().as_uri()}?mode=ro{'' if logged else '&immutable=1'}"
         self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
         try:
@@ -53,7 +53,7 @@ class SqliteStorage:
             self._database.close()
             if logged and isinstance(error, sqlite3.OperationalError):
                 raise ReaderError(
-                    f"{path.name} was not closed, and its log beside it can't be used here ({error}); copy the whole"
+                    f"{path.name} was not closed, and its log next to it can't be used here ({error}); copy the whole"
                     f" folder to where you can write, and type: sqlite3 {path.name} 'SELECT COUNT(*) FROM messages'"
                 ) from error
             if isinstance(error, sqlite3.DatabaseError):

@@ -118,7 +118,7 @@ def channel(
 
 
 def _qos(text: str) -> Qos | None:
-    """Return the first quality of service of a text; None where it has none, or one that nobody can read."""
+    """Return the first quality of service of a text; None where it has none that can be read."""
     try:
         return next(iter(parse_qos(text)), None)
     except DAMAGE:

@@ -112,8 +112,8 @@ def _of_pairs(path: Path, source: Source, given: Foreign) -> Outcome:
     if kind not in KINDS:
         tried = search(_robot(source, given, "in_hand"), board, ("in_hand", "to_hand"))
         # which of the two the poses tell where their direction is known
-        told = tried[0].fits and source.robot.name != EASY_HANDEYE2
-        fits = f": {tried[0].text} leaves {tried[0].left}" if told else ""
+        certain = tried[0].fits and source.robot.name != EASY_HANDEYE2
+        fits = f": {tried[0].text} leaves {tried[0].left}" if certain else ""
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             f"{path} does not say whether the hand carries the camera; give --camera-kind eye_in_hand or"

@@ -3,7 +3,7 @@
 
 A wrong form of a rotation turns from pose to pose by other angles than the board does, so that forms are compared
 first, by angles alone. Of those that agree the mounts that most pairs agree with are solved, with the lengths of the
-board in a unit of their own, for either equation: a camera on the hand, and a fixed one. What can't be told: a camera
+board in a unit of their own, for either equation: a camera on the hand, and a fixed one. What can't be found: a camera
 on the hand with inverted poses of the robot, or of the board, gives the equation of a fixed one with poses as they are.
 So the kind of the camera and the direction of poses are stated, or taken to be T_base_tip and T_camera_board.
 """

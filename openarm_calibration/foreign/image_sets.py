@@ -27,6 +27,7 @@ from openarm_calibration.handeye.problem import Setup
 from openarm_calibration.handeye.transforms import inverses
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3
+from openarm_common.camera.depth_view import check_size
 from openarm_common.camera.lens import Lens
 from openarm_common.camera.pictures import decode_picture, to_bytes
 from openarm_common.config import validate
@@ -88,12 +89,8 @@ def grey_of(data: bytes, lens: Lens, where: str) -> Bytes:
     Raises:
         OpenArmError: BAD_IMAGE, when it is none, damaged, or of another size than the intrinsics.
     """
-    picture, k = to_bytes(decode_picture(data, where)), lens.intrinsics
-    if picture.shape[:2] != (k.height, k.width):
-        raise OpenArmError(
-            Code.BAD_IMAGE,
-            f"{where} has {picture.shape[1]}x{picture.shape[0]} pixels, the intrinsics are of {k.width}x{k.height}",
-        )
+    picture = to_bytes(decode_picture(data, where))
+    check_size(where, picture.shape, lens.intrinsics)
     to_grey = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
     return picture if picture.ndim == 2 else cv2.cvtColor(picture, to_grey[picture.shape[2]]).astype(np.uint8)
 

@@ -54,7 +54,7 @@ def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> Non
     if shape[:2] != (intrinsics.height, intrinsics.width):
         raise OpenArmError(
             Code.BAD_IMAGE,
-            f"{what} is {shape[1]}x{shape[0]} pixels, but its CameraInfo, or the file of its intrinsics, says"
+            f"{what} is {shape[1]}x{shape[0]} pixels, but its intrinsics (camera_info) are of"
             f" {intrinsics.width}x{intrinsics.height}; both must come from the same stream",
         )
 

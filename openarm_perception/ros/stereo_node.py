@@ -22,6 +22,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import info_from_intrinsics, stamp_to_ns
 from openarm_common.ros.images import (
     array_to_image,
+    is_rectified,
     lens_from_info,
     projection_from_info,
     rgb_image,
@@ -151,7 +152,7 @@ class StereoNode(BaseNode[StereoNodeConfig]):
                 lenses = lens_from_info(left), lens_from_info(right)
                 rectification = Rectification.from_pose(*lenses, self._T_left_right)
             else:
-                ready = self.config.rectified
+                ready = self.config.rectified or is_rectified(self.config.left_topic)
                 rectification = Rectification(_rectified(left, ready), _rectified(right, ready))
             self._matcher, self._made_of = StereoMatcher(self.config.matcher, rectification, self._limits), made_of
         return self._matcher

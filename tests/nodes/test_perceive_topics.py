@@ -358,7 +358,7 @@ def test_every_encoding_is_scaled_as_said():
 def test_what_does_not_belong_together_is_refused():
     color, depth, info = messages(0)
     info.width = 320
-    said = "depth image is 160x120 pixels, but its CameraInfo, .* says 320x120"
+    said = "depth image is 160x120 pixels, but its intrinsics .* are of 320x120"
     refused(said, frame_of, color, depth, info, DepthLimits())
     info.k = np.zeros(9)
     refused("is not calibrated", frame_of, color, depth, info, DepthLimits())

@@ -170,7 +170,7 @@ HAND = ("--camera-kind", "eye_in_hand")
         (
             ("poses.csv", *HAND, *IMAGES[:4], "--intrinsics", "1280,720,900,900,640,360"),
             1,
-            "the intrinsics are of 1280x720",
+            "but its intrinsics (camera_info) are of 1280x720",
         ),
         (("poses.csv", *HAND, *IMAGES[2:], "--images", "few"), 2, "has 0 images for 6 poses"),
         (("poses.csv", *HAND, *IMAGES[2:], "--images", "broken"), 1, "is no image that can be read"),

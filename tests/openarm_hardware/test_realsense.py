@@ -79,7 +79,7 @@ def test_depth_is_aligned_to_colour() -> None:
 
 @pytest.mark.requirement("M-02")
 def test_depth_is_aligned_by_us_as_by_the_library() -> None:
-    """`perceive` aligns depth of drivers that do not: with this device's optics, 55 mm beside the colour camera."""
+    """`perceive` aligns depth of drivers that do not: with this device's optics, 55 mm from the colour camera."""
     place = (0.055, 0.004, 0.0)
     device = SoftwareRealSense(place=place)
     camera = camera_of(device)

@@ -206,7 +206,7 @@ def test_an_array_is_a_depth_image(tmp_path, kind):
     [
         (np.zeros((12, 16), np.int64), "1 channel.*int64; .* such as depth.astype"),
         (np.zeros((12, 16, 3), np.uint16), "3 channel"),
-        (np.zeros((12, 15), np.uint16), "z.npy is 15x12 pixels, but .* says 16x12"),
+        (np.zeros((12, 15), np.uint16), "z.npy is 15x12 pixels, but .* are of 16x12"),
         (np.zeros((3, 2000, 2000), np.uint8), "pixels|channel"),
         (np.zeros(12), "has an array"),
         (np.array(["a"]), "has an array"),
