@@ -27,7 +27,7 @@ from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import stamp_to_ns, transform_to_matrix
-from openarm_common.ros.images import AnyImage, color_of, depth_of, grey_image, lens_from_info
+from openarm_common.ros.images import AnyImage, color_of, depth_of, grey_image, is_rectified, lens_from_info
 from openarm_common.ros.tf import table_height
 from openarm_common.scene.scene import load_scene
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
@@ -49,6 +49,7 @@ class _Shot:
 
     camera: CameraConfig
     t_ns: int
+    rectified: bool
     color: AnyImage | None = None
     depth: AnyImage | None = None
     info: CameraInfo | None = None
@@ -131,11 +132,12 @@ def _read(bag: Bag, description: RobotDescription) -> tuple[list[_Shot], RobotSt
             states.set_static(edge.header.frame_id, edge.child_frame_id, transform_to_matrix(edge.transform))
     for message in sorted(found["/joint_states"], key=_stamp):
         states.add_joint_state(_stamp(message), message.name, message.position, message.velocity)
+    rectified = {name: is_rectified(topic) for topic, (name, part) in topics.items() if part == "color"}
     shots: dict[tuple[int, str], _Shot] = {}
     for topic, (name, part) in topics.items():
         for message in found[topic]:
             t_ns = _stamp(message)
-            setattr(shots.setdefault((t_ns, name), _Shot(cameras[name], t_ns)), part, message)
+            setattr(shots.setdefault((t_ns, name), _Shot(cameras[name], t_ns, rectified[name])), part, message)
     return [shots[key] for key in sorted(shots)], states
 
 
@@ -148,7 +150,7 @@ def _work(shot: _Shot, states: RobotStateBuffer, pipeline: Pipeline, mapper: Map
         raise OpenArmError(Code.BAD_IMAGE, "colour, depth or camera_info of a stamp is missing")
     T_base_camera = states.lookup(RobotDescription.load().base, shot.camera.optical_frame, shot.t_ns)
     joints = states.joints_at(shot.t_ns)
-    lens = lens_from_info(shot.info)
+    lens = lens_from_info(shot.info, rectified=shot.rectified)
     rgb, depth = color_of(shot.color, lens), depth_of(shot.depth, lens)
     for located in pipeline.run(rgb, depth, lens.intrinsics, T_base_camera).located:
         found.objects[f"{shot.camera.name}/{located.label}"].append(located)
