@@ -25,8 +25,8 @@ def perceive(
     start: float = 0.0,
     out: Path | None = None,
     depth_scale: float | None = None,
-    rectified: bool | None = None,
-    registered: bool | None = None,
+    rectified: Literal["auto", "yes", "no"] = "auto",
+    registered: Literal["auto", "yes", "no"] = "auto",
     pose: Path | None = None,
     background: Path | None = None,
     near: float = 0.1,
@@ -55,10 +55,10 @@ def perceive(
         out: Folder for pictures, the label image and a page.
         depth_scale: Metres of a count of depth, of every encoding: 0.0001 for a D405, 0.0002 for TUM, 0.001 for floats
             in mm; 0.001 for integers and 1 for floats when not given.
-        rectified: Whether the images of a bag or graph are without distortion, whatever their CameraInfo says; by the
-            names of their topics, such as image_rect, when not given.
+        rectified: Whether the images of a bag or graph are without distortion, whatever their CameraInfo says; auto: by
+            the names of their topics, such as image_rect.
         registered: Whether the depth of a bag or graph lies on the pixels of the colour image, whatever its frame is
-            called; by the name of its topic, such as depth_registered, when not given.
+            called; auto: by the name of its topic, such as depth_registered.
         pose: Text file with the camera's pose (optical frame), four rows of four numbers, in a frame whose z is up.
         background: Depth image, or cloud, of the empty table or box from the same place.
         near: Nearest depth that counts, m.
@@ -91,7 +91,7 @@ def perceive(
     cloud = None
     bag = len(files) == 1 and not is_cloud(files[0]) and (files[0].is_dir() or is_recording(files[0]))
     of_topics = bag or not files
-    if not of_topics and (color or depth or camera or (rectified, registered) != (None, None)):
+    if not of_topics and (color or depth or camera or (rectified, registered) != ("auto", "auto")):
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             "--color, --depth, --camera, --rectified and --registered are for topics of a bag or of the running graph",

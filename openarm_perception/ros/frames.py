@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from sensor_msgs.msg import CameraInfo
@@ -65,8 +65,8 @@ class CameraChoice:
         info: Topic of the CameraInfo of the colour image, likewise.
         lens: Lens of the colour camera; None: by its CameraInfo.
         depth_scale: Metres of a count of depth; None as for `metres`.
-        rectified: Whether the images are without distortion, whatever their CameraInfo says; None: by their names.
-        registered: Whether depth lies on the pixels of colour, whatever its frame is called; None: by its name.
+        rectified: Whether the images are without distortion, whatever their CameraInfo says; auto: by their names.
+        registered: Whether depth lies on the pixels of colour, whatever its frame is called; auto: by its name.
     """
 
     camera: str = ""
@@ -75,8 +75,8 @@ class CameraChoice:
     info: str = ""
     lens: Lens | None = None
     depth_scale: float | None = None
-    rectified: bool | None = None
-    registered: bool | None = None
+    rectified: Literal["auto", "yes", "no"] = "auto"
+    registered: Literal["auto", "yes", "no"] = "auto"
 
 
 ONLY = CameraChoice()
@@ -254,7 +254,7 @@ class FrameBuilder:
         names, chosen, counts = self._topics, self._chosen, depth_image(depth)
         seen = _View(names.info, self._rectified(names.color))
         lens = self._lens(seen)
-        registered = _REGISTERED.search(names.depth) is not None if chosen.registered is None else chosen.registered
+        registered = _REGISTERED.search(names.depth) if chosen.registered == "auto" else chosen.registered == "yes"
         info, as_color = names.depth_info, True
         if not info or (registered and counts.shape == (lens.intrinsics.height, lens.intrinsics.width)):
             info = names.info
@@ -275,7 +275,7 @@ class FrameBuilder:
         return Frame(points, rgb, lens.intrinsics, unit, of_depth if on_color else None)
 
     def _rectified(self, image: str) -> bool:
-        return is_rectified(image) if self._chosen.rectified is None else self._chosen.rectified
+        return is_rectified(image) if self._chosen.rectified == "auto" else self._chosen.rectified == "yes"
 
     def _lens(self, view: _View) -> Lens:
         """Return a lens: the given one of colour, or by a CameraInfo."""
@@ -318,7 +318,7 @@ class _View(NamedTuple):
 
 _ALIGN = (
     "take depth that the driver aligns with colour (RealSense: align_depth.enable:=true) by --depth, or type"
-    " --registered where it lies on the pixels of colour already"
+    " --registered yes where it lies on the pixels of colour already"
 )
 
 

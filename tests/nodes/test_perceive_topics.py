@@ -20,7 +20,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code
 from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform
-from openarm_common.ros.images import array_to_image, image_to_array
+from openarm_common.ros.images import array_to_image, image_to_array, lens_from_info
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_perception.geometry.depth import DepthLimits
 from openarm_perception.ros.frames import (
@@ -249,14 +249,26 @@ def test_what_names_of_topics_do_not_say_is_said_by_options(tmp_path):
     z.header.frame_id = "somewhere"
     (tmp_path / "k.png").touch()
     write(tmp_path / "bag", {"/c/color/image_raw": rgb, "/c/color/camera_info": info, "/c/depth/image_raw": z})
-    refused("or type --registered where it lies on the pixels of colour", perceive, tmp_path / "bag")
-    check(perceive(tmp_path / "bag", registered=True, rectified=True).data)
-    (one,) = perceive(tmp_path / "bag", registered=True).data["clusters"]
+    refused("or type --registered yes where it lies on the pixels of colour", perceive, tmp_path / "bag")
+    check(perceive(tmp_path / "bag", registered="yes", rectified="yes").data)
+    (one,) = perceive(tmp_path / "bag", registered="yes").data["clusters"]
     assert one["size"][1] < 0.078
     write(tmp_path / "plain", {"/c/color/image_rect": rgb, "/c/color/camera_info": info, "/c/depth/image_raw": z})
-    (again,) = perceive(tmp_path / "plain", registered=True, rectified=False).data["clusters"]
+    (again,) = perceive(tmp_path / "plain", registered="yes", rectified="no").data["clusters"]
     assert again["size"] == one["size"]
-    refused("are for topics of a bag", perceive, tmp_path / "k.png", tmp_path / "k.png", rectified=True)
+    topics = {"/c/color/image_raw": rgb, "/c/color/camera_info": info, "/c/depth_registered/image_raw": z}
+    write(tmp_path / "named", topics)
+    assert perceive(tmp_path / "named").data["clusters"]
+    refused("the depth has no camera_info; take depth", perceive, tmp_path / "named", registered="no")
+    refused("are for topics of a bag", perceive, tmp_path / "k.png", tmp_path / "k.png", rectified="yes")
+
+
+@pytest.mark.requirement("M-01")
+def test_a_frame_keeps_the_lens_of_its_depth_which_is_that_of_a_background():
+    color, depth, info = messages(0)
+    info.d, info.distortion_model = [-0.2, 0.05, 0.0, 0.0, 0.0], "plumb_bob"
+    found = frame_of(color, depth, info, DepthLimits())
+    assert (found.lens, found.intrinsics) == (lens_from_info(info), LENS)
 
 
 @pytest.mark.requirement("M-02")
