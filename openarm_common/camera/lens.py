@@ -68,7 +68,7 @@ class Lens:
 
     @property
     def d(self) -> Array:
-        """The coefficients as OpenCV takes them; those of fisheyes beyond its four are none of its model."""
+        """The coefficients as OpenCV takes them: four of a fisheye, zeros where there are none."""
         return np.array(self.coefficients[: 4 if self.fisheye else None] or (0.0,) * 4)
 
     def undistorted(self, pixels: Array) -> Array:

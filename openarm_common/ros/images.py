@@ -55,9 +55,9 @@ _COLORS: dict[str, tuple[type[np.generic], int, int | None]] = {
     "nv12": (np.uint8, 1, cv2.COLOR_YUV2RGB_NV12),
     "nv21": (np.uint8, 1, cv2.COLOR_YUV2RGB_NV21),
 }
-#: Brightness of all pixels, and below it colour of each two by two, in half as many rows.
+#: Encodings with brightness of all pixels, and below it colour of each two by two, in half as many rows.
 _SEMI_PLANAR = ("nv12", "nv21")
-#: Of two pixels next to each other.
+#: Encodings in which pixels next to each other share their colour.
 _PAIRED = ("yuv422", "uyvy", "yuv422_yuy2", "yuyv", *_SEMI_PLANAR)
 _DEPTHS: dict[str, type[np.generic]] = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
 #: Names of images without distortion, while their CameraInfo is that of the lens, as those of image_proc. What a
@@ -90,9 +90,7 @@ def image_to_array(message: Image) -> NDArray[np.generic]:
             f" bytes, expected step >= {row} and step × {'3/2 ' if planar else ''}height bytes"
         )
     if message.encoding in _PAIRED and (message.width % 2 or (planar and message.height % 2)):
-        raise _bad_image(
-            f"image {message.encoding} is {message.width}×{message.height} pixels, expected an even number"
-        )
+        raise _bad_image(f"image {message.encoding} is {message.width}×{message.height} pixels, expected even numbers")
     rows = np.frombuffer(message.data, dtype=np.uint8).reshape(height, message.step)[:, :row]
     pixels = rows if rows.flags.c_contiguous else np.ascontiguousarray(rows)
     shape = (height, message.width, channels) if channels > 1 else (height, message.width)
@@ -198,7 +196,7 @@ def lens_from_info(info: CameraInfo, *, rectified: bool = False) -> Lens:
 
     Args:
         info: CameraInfo of the camera.
-        rectified: Whether its images are rectified, as those of image_proc's `image_rect` are: by P then, not by K.
+        rectified: Whether its images are rectified, as those of image_proc's `image_rect` are: by P then, where it is.
 
     Raises:
         OpenArmError: BAD_IMAGE, when the camera is not calibrated (K is zero), or has another distortion model.
@@ -208,9 +206,9 @@ def lens_from_info(info: CameraInfo, *, rectified: bool = False) -> Lens:
         (info.roi.height or info.height) // max(info.binning_y, 1),
     )
     where = f"camera_info of {info.header.frame_id!r}"
-    if rectified and info.p[0] > 0.0:
-        return _lens(size, tuple(projection_from_info(info)[:, :3].ravel().tolist()), "", (), where)
-    return _lens(size, tuple(_in_part(info.k, info).ravel().tolist()), info.distortion_model, tuple(info.d), where)
+    K = projection_from_info(info)[:, :3] if rectified and info.p[0] > 0.0 else _in_part(info.k, info)
+    model, d = ("", ()) if rectified else (info.distortion_model, tuple(info.d))
+    return _lens(size, tuple(K.ravel().tolist()), model, d, where)
 
 
 _lens = lru_cache(maxsize=32)(lens_of)

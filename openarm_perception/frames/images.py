@@ -100,7 +100,7 @@ def _organised(counts: DepthImage, lens: Lens, depth_scale: float | None, limits
 
 def is_depth(path: Path) -> bool:
     """Whether an array in a file is a depth image (h, w), and no cloud (n, 3) or (n, 6)."""
-    if path.suffix != ".npy":
+    if path.suffix.lower() != ".npy":
         return False
     shape = read_array(path, "a cloud or a depth image").shape
     return len(shape) == 2 and shape[1] > 6
@@ -108,11 +108,13 @@ def is_depth(path: Path) -> bool:
 
 def _read_counts(path: Path, lens: Lens) -> DepthImage:
     expected = "a depth image: one channel of 16 bits, or of floats"
-    if path.suffix == ".npy":
+    if path.suffix.lower() == ".npy":
         expected += "; (h, w), such as depth.astype(numpy.uint16)"
         z = _checked_size(read_array(path, expected), path)
-        with np.errstate(over="ignore"):
-            z = z.astype(np.float32 if z.dtype.kind == "f" else z.dtype.newbyteorder("="))
+        kind = np.float32 if z.dtype.kind == "f" else np.uint16 if z.dtype.name == "uint16" else None
+        if kind is not None and z.ndim == 2:
+            with np.errstate(over="ignore"):
+                z = z.astype(kind)
     else:
         z = _read_image(path)
     if z.dtype.name not in ("uint16", "float32") or z.ndim != 2:

@@ -86,6 +86,9 @@ def test_images_of_image_proc_have_the_intrinsics_of_p() -> None:
     info.p[0] = 400.0
     found = lens_from_info(info, rectified=True)
     assert (found.straight, found.intrinsics.fx) == (True, 400.0)
+    info.p[0] = 0.0
+    found = lens_from_info(info, rectified=True)
+    assert (found.straight, found.intrinsics.fx) == (True, info.k[0])
 
 
 def test_binning_and_region_leave_the_lens_of_the_images_that_come() -> None:
