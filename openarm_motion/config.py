@@ -164,6 +164,7 @@ class MoveGroupConfig(Config):
         default="parallel", description="its type: ParallelGripperCommand, or the older GripperCommand"
     )
     finger_speed: float = Field(default=0.1, gt=0.0, le=2.0, description="of fingers in plans, m/s or rad/s")
+    map: str = Field(default="/octomap_full", description="service that has the octomap of the planning scene")
     clear_map: str = Field(default="/octomap/reset", description="service that /clear_octomap calls")
 
 

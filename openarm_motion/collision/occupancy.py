@@ -79,6 +79,15 @@ class OccupancyMap:
             left &= ~body.inside(centres, padding)
         return self if left.all() else replace(self, indices=self.indices[left])
 
+    def united(self, other: OccupancyMap) -> OccupancyMap:
+        """The cells of both, which are of one size."""
+        both = (self, other)
+        first = np.min([one.lattice.key_min for one in both], axis=0)
+        end = np.max([np.add(one.lattice.key_min, one.lattice.shape) for one in both], axis=0)
+        indices = np.concatenate([one.indices + (np.array(one.lattice.key_min) - first) for one in both])
+        (x, y, z), (nx, ny, nz) = first.tolist(), (end - first).tolist()
+        return replace(self, indices=indices, lattice=Lattice(self.lattice.resolution, (x, y, z), (nx, ny, nz)))
+
     def minus(self, rows: NDArray[np.int64]) -> OccupancyMap:
         """The map without some of its cells."""
         return replace(self, indices=np.delete(self.indices, rows, axis=0))

@@ -23,11 +23,11 @@ class RobotNames:
     def __init__(self, description: RobotDescription, arms: Mapping[str, Arm]) -> None:
         self._description, self._arms = description, arms
 
-    def arm_of_group(self, group: str) -> str:
-        """Return the arm whose joints are those of a group of the SRDF.
+    def arms_of_group(self, group: str) -> tuple[str, ...]:
+        """Return the arms whose joints are those of a group of the SRDF.
 
         Raises:
-            OpenArmError: INVALID_ARGUMENT, listing the groups that are arms.
+            OpenArmError: INVALID_ARGUMENT, listing the groups of arms.
         """
         arms = self.groups()
         if group not in arms:
@@ -35,12 +35,12 @@ class RobotNames:
             raise OpenArmError(Code.INVALID_ARGUMENT, text)
         return arms[group]
 
-    def groups(self) -> dict[str, str]:
-        """Return the arms by the groups of the SRDF that have just their joints."""
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Return the arms by the groups of the SRDF that have just their joints: those of one arm, or of two."""
         found = (
-            (g, self.arm_of_joints(self._description.group_joints(g))) for g in self._description.semantics.members
+            (g, self.arms_of_joints(self._description.group_joints(g))) for g in self._description.semantics.members
         )
-        return {group: arm for group, arm in found if arm}
+        return {group: arms for group, arms in found if arms}
 
     def hands(self) -> dict[str, str]:
         """Return by group of the SRDF the arm whose hand has just its joints."""
@@ -48,9 +48,23 @@ class RobotNames:
         members = {g: self._description.group_joints(g) for g in self._description.semantics.members}
         return {g: arm for g, joints in members.items() for arm, finger in fingers.items() if joints[:1] == (finger,)}
 
-    def arm_of_joints(self, joints: Sequence[str]) -> str:
-        """Return the arm that has just these joints, in whatever order; "": none."""
-        return next((name for name, arm in self._arms.items() if set(arm.names) == set(joints) and joints), "")
+    def arms_of_joints(self, joints: Sequence[str]) -> tuple[str, ...]:
+        """Return the one or two arms that have just these joints, in whatever order; empty: there are none."""
+        arms = tuple(name for name, arm in self._arms.items() if set(arm.names) <= set(joints))
+        whole = len(arms) <= 2 and sorted(joint for name in arms for joint in self._arms[name].names) == sorted(joints)
+        return arms if whole else ()
+
+    def arm_of_joint(self, joint: str, arms: Sequence[str]) -> str:
+        """Return which of some arms has a joint.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing their joints.
+        """
+        for arm in arms:
+            if joint in self._arms[arm].names:
+                return arm
+        there = ", ".join(name for arm in arms for name in self._arms[arm].names)
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"constraint of joint {joint!r}; joints of the arms: {there}")
 
     def on_tool(self, arm: str, link: str) -> Array:
         """Return the pose (4, 4) of a link that moves with an arm's tool, in the frame of the tool; "" is the tool.
@@ -73,13 +87,13 @@ class RobotNames:
         joints = self._moving(self._arms[arm].kinematics.tool_link)
         return [link for link in self._description.links if self._moving(link) == joints]
 
-    def arm_of_link(self, link: str) -> str:
-        """Return the arm that carries a link of its hand.
+    def arm_of_link(self, link: str, arms: Sequence[str] = ()) -> str:
+        """Return the arm that carries a link of its hand, of all arms or some.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, listing the links of hands.
         """
-        for arm in self._arms:
+        for arm in arms or self._arms:
             if link in self.links_on_tool(arm):
                 return arm
         there = ", ".join(link for arm in self._arms for link in self.links_on_tool(arm))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from openarm_motion.constraints.regions import Region
 from openarm_motion.kinematics.line import solve_line
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.failure import PlanFailedError
-from openarm_motion.planning.moves import RequestBoxes, free_scene
+from openarm_motion.planning.moves import RequestBoxes, free_scene, some_of_all
 from openarm_motion.timing.trajectory import Trajectory
 
 #: Goals of one search, and those that lines are tried to.
@@ -40,7 +41,7 @@ def to_region(arm: Arm, now: StartState, goal: RegionGoal, around: RequestBoxes)
             path has to satisfy; NO_PLAN.
         OpenArmError: INVALID_ARGUMENT; LIMITS; CANCELLED.
     """
-    end = time.monotonic() + (goal.time_limit or arm.config.planning.time_limit)
+    end = _end(arm, goal)
     scene = free_scene(arm, now, around)
     wanted = _configurations(arm, now, goal.regions, end)
     free = [q for q in wanted if not scene.collides(q)]
@@ -52,6 +53,19 @@ def to_region(arm: Arm, now: StartState, goal: RegionGoal, around: RequestBoxes)
         goals = np.array(free[:_GOALS])
         return arm.plan_validated(scene, now, goals, max(end - time.monotonic(), 0.05)).trajectory
     return _constrained(arm, now, scene, free, goal.path, end)
+
+
+def reaching(arm: Arm, now: StartState, start: Array, goal: RegionGoal) -> Array:
+    """Configurations (k, n) of one of two arms in one of the regions, those that are reached first come first.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT; LIMITS; UNREACHABLE.
+    """
+    return some_of_all(_configurations(arm, replace(now, start=start), goal.regions, _end(arm, goal)))
+
+
+def _end(arm: Arm, goal: RegionGoal) -> float:
+    return time.monotonic() + (goal.time_limit or arm.config.planning.time_limit)
 
 
 def _configurations(arm: Arm, now: StartState, regions: Sequence[Region], end: float) -> list[Array]:

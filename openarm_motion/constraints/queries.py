@@ -27,7 +27,7 @@ class Verdict:
 
     Attributes:
         contacts: Pairs that are nearer than plans keep, the deepest first.
-        constraints: What is constrained, and how far it is beyond the tolerance, m or rad.
+        constraints: What is constrained, and how far it is beyond the tolerance, m or rad, times its weight.
         limits: The joint that is beyond its limits, in words; "" where none is.
     """
 
@@ -86,7 +86,8 @@ def judge(arm: Arm, now: StartState, around: RequestBoxes, region: Region) -> Ve
     scene = arm.scene(now.state, around.obstacles, around.attached, environment=now.environment)
     contacts = tuple(scene.contacts(now.start)) if scene.collides(now.start) else ()
     pose = arm.kinematics.fk(now.start)
-    parts = tuple((what, float(b[0])) for what, b in region.outside(arm.names, now.start[None], pose[None]))
+    outside = region.outside(arm.names, now.start[None], pose[None])
+    parts = tuple((what, weight * float(b[0])) for (what, b), weight in zip(outside, region.weights, strict=True))
     return Verdict(contacts, parts)
 
 

@@ -25,12 +25,13 @@ POSE_M, POSE_RAD = 1e-3, 1e-3
 
 @dataclass(frozen=True)
 class JointInterval:
-    """Position of a joint, and how far it may be above and below, rad or m."""
+    """Position of a joint, and how far it may be above and below, rad or m; `weight` as in `Region.weights`."""
 
     joint: str
     position: float
     above: float
     below: float
+    weight: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuse numbers that are no interval.
@@ -88,6 +89,7 @@ class PositionRegion:
     link: str
     p_tool: Array
     volumes: tuple[Volume, ...]
+    weight: float = 1.0
 
     def excess(self, poses: Array) -> Array:
         """How far outside the point is at poses (m, 4, 4) of the tool, m."""
@@ -112,6 +114,7 @@ class OrientationRegion:
     R: Array
     tolerance: tuple[float, float, float]
     vector: bool = False
+    weight: float = 1.0
 
     def excess(self, poses: Array) -> Array:
         """How far the worst angle is beyond its tolerance at poses (m, 4, 4) of the tool, rad."""
@@ -141,6 +144,11 @@ class Region:
     def __bool__(self) -> bool:
         """Whether anything is constrained."""
         return bool(self.joints or self.positions or self.orientations)
+
+    @property
+    def weights(self) -> tuple[float, ...]:
+        """What the distances of `outside` count for when a state is judged, part by part; all must be 0 anyhow."""
+        return tuple(part.weight for part in (*self.joints, *self.positions, *self.orientations))
 
     @property
     def one_pose(self) -> bool:

@@ -10,7 +10,8 @@ import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any, TypeAlias
 
@@ -74,6 +75,7 @@ class StartState:
         scale: Of velocity, or of velocity and acceleration; 0 means the default.
         stopped: Whether the request was cancelled; asked often.
         environment: Bodies of the planning scene and the map.
+        seeds: Added to that of the searches, one for each of them; the path that is followed soonest is taken.
     """
 
     state: Mapping[str, float]
@@ -81,6 +83,7 @@ class StartState:
     scale: Scale = 0.0
     stopped: Callable[[], bool] = never
     environment: Environment = NOTHING
+    seeds: Sequence[int] = (0,)
 
 
 class PlanningGroup(ABC):
@@ -131,7 +134,7 @@ class PlanningGroup(ABC):
             edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
             time_limit=time_limit,
             iterations=search.iterations,
-            seed=search.seed,
+            seed=search.seed + now.seeds[0],
             stopped=now.stopped,
             fast=None if scene.exact_only else cache(lambda: FastScene(scene.arms, scene.arms[0].distances)),
             resolution=(step, travel),
@@ -150,6 +153,7 @@ class PlanningGroup(ABC):
 
         Where the straight joint line to one of the first goals keeps the full clearance all the way, there is nothing
         to search. Where the validation finds what the search stepped over, the search is repeated with finer steps.
+        What is no straight line is searched for once with each of the start's seeds, as far as time allows.
 
         Args:
             scene: What it keeps clear of.
@@ -165,6 +169,25 @@ class PlanningGroup(ABC):
         direct = self._direct(scene, now, goals) if self.direct else None
         if direct is not None and validate is None:
             return direct
+        best = self._searched(scene, now, goals, end, validate, direct)
+        for seed in now.seeds[1:]:
+            if len(best.path.waypoints) == 2 or time.monotonic() > end or now.stopped():
+                break
+            with suppress(PlanFailedError):
+                found = self._searched(scene, replace(now, seeds=(seed,)), goals, end, validate, None)
+                best = min(best, found, key=lambda plan: plan.trajectory.duration)
+        return best
+
+    def _searched(
+        self,
+        scene: LineChecks,
+        now: StartState,
+        goals: Array,
+        end: float,
+        validate: Callable[[Any, Trajectory], object] | None,
+        direct: ValidatedPlan | None,
+    ) -> ValidatedPlan:
+        """One plan: as `plan_validated`, with an end on the monotonic clock, s, and a straight line to try first."""
         fault, contact = "", None
         for fineness in _FINENESS:
             path = direct.path if direct else self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
@@ -283,8 +306,8 @@ class Arm(PlanningGroup):
             raise OpenArmError(Code.LIMITS, f"{what}: {self.kinematics.outside(q)}")
         return np.clip(q, self.kinematics.lower, self.kinematics.upper)
 
-    def scale(self, requested: Scale) -> float:
-        """Velocity scale of a request; 0 is the default.
+    def scale(self, requested: Scale, what: str = "velocity_scale") -> float:
+        """Velocity scale of a request, whose field has the name `what`; 0 is the default.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, when it is neither 0 nor from `_SLOWEST` to 1.
@@ -294,7 +317,7 @@ class Arm(PlanningGroup):
         if requested == 0.0:
             return self.config.limits.default_scale
         if not _SLOWEST <= requested <= 1.0:
-            text = f"velocity_scale is {requested}, expected {_SLOWEST:g} to 1 (or 0 for the default)"
+            text = f"{what} is {requested}, expected {_SLOWEST:g} to 1 (or 0 for the default)"
             raise OpenArmError(Code.INVALID_ARGUMENT, text)
         return requested
 

@@ -201,6 +201,14 @@ class DualArmPlan:
     start_delays: tuple[float, float]
     clearance: float
 
+    @property
+    def whole(self) -> Trajectory:
+        """Both trajectories as one of all joints."""
+        times = np.union1d(*(part.t for part in self.trajectories))
+        names = tuple(name for part in self.trajectories for name in part.names)
+        columns = zip(*(part.at(times) for part in self.trajectories), strict=True)
+        return Trajectory(names, times, *(np.hstack(both) for both in columns))
+
 
 def plan_together(both: DualArm, now: StartState, wanted: DualArmGoals, time_limit: float) -> DualArmPlan:
     """One path of all joints.
@@ -259,7 +267,7 @@ def plan_staggered(both: DualArm, now: StartState, wanted: DualArmGoals, time_li
         raise OpenArmError(faults[0].code, f"neither arm can go first: {text}")
     best = min(found, key=lambda plan: max(part.duration for part in plan.trajectories))
     scene = both.scene(now.state, held=wanted.held)
-    return replace(best, clearance=separation(scene, joined(both, best.trajectories)))
+    return replace(best, clearance=separation(scene, best.whole))
 
 
 def plan_any(both: DualArm, now: StartState, wanted: DualArmGoals, time_limit: float) -> DualArmPlan:
@@ -319,13 +327,6 @@ def _in_order(both: DualArm, now: StartState, wanted: DualArmGoals, first: int, 
     if first == 0:
         return DualArmPlan((early, delayed(late, wait)), (0.0, wait), np.nan)
     return DualArmPlan((delayed(late, wait), early), (wait, 0.0), np.nan)
-
-
-def joined(both: DualArm, parts: tuple[Trajectory, Trajectory]) -> Trajectory:
-    """Both trajectories as one of all joints."""
-    times = np.union1d(parts[0].t, parts[1].t)
-    (q0, v0, a0), (q1, v1, a1) = (part.at(times) for part in parts)
-    return Trajectory(both.names, times, np.hstack([q0, q1]), np.hstack([v0, v1]), np.hstack([a0, a1]))
 
 
 def _alone(

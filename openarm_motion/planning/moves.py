@@ -167,8 +167,11 @@ def goal_configurations(arm: Arm, now: StartState, start: Array, pose: Array, *,
     Raises:
         PlanFailedError: UNREACHABLE, with the reason.
     """
-    # of a whole turn of the elbow, some of every part: the nearest alone may all meet the other arm
-    ordered = _configurations(arm, now.scale, start, pose, position_only=position_only)
+    return some_of_all(_configurations(arm, now.scale, start, pose, position_only=position_only))
+
+
+def some_of_all(ordered: Sequence[Array]) -> Array:
+    """Of a whole turn of the elbow some of every part, (k, n): the nearest alone may all meet the other arm."""
     return np.array(ordered[:: max(1, len(ordered) // _MOST)][:_MOST])
 
 

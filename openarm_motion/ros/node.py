@@ -190,7 +190,7 @@ class MotionNode(BaseNode[MotionConfig]):
         def convert_held(message: Any) -> MovingT:
             request = convert_goal(message)
             if not getattr(request, "plan_only", False):
-                for arm in [t.arm for t in request.targets] if isinstance(request, MoveArmsRequest) else [request.arm]:
+                for arm in request.arms:
                     self._holds.check(arm, bytes(handle.goal_id.uuid))
             return request
 

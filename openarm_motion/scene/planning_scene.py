@@ -9,6 +9,7 @@ from openarm_common.errors import Code
 from openarm_motion.collision.occupancy import MAP
 from openarm_motion.collision.solids import Box, Solid
 from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.scene.octree import SceneOctree
 
 
 class PlanningScene:
@@ -24,11 +25,19 @@ class PlanningScene:
         self._solids: dict[str, Solid] = {}
         #: Pairs of links and bodies that may touch, in addition to those of the SRDF.
         self.allowed: frozenset[frozenset[str]] = frozenset()
+        #: What is occupied in addition to the bodies and the map.
+        self.octree: SceneOctree | None = None
 
     def allow(self, pairs: frozenset[frozenset[str]]) -> None:
         """Let these pairs of links and bodies touch, by name, and no others but those of the SRDF."""
         if pairs != self.allowed:
             self.allowed = pairs
+            self.version += 1
+
+    def see(self, octree: SceneOctree | None) -> None:
+        """Take an octree in place of the one there was; None takes it away."""
+        if octree is not self.octree:
+            self.octree = octree
             self.version += 1
 
     @property

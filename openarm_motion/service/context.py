@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 #: Next to an arm under way plans keep this distance from where it will end, m: more than what is then proven.
 _NEXT_TO = 0.035
+#: Hands, and what they hold, are no further from the tool, m.
+_BEYOND = 0.5
 #: Other joints that move less than this are where they were, rad or m.
 _STILL = 2e-3
 
@@ -103,7 +105,7 @@ class PlanningContext:
 
         Args:
             arms: The arms that are asked; the start is that of all of them, one after the other.
-            start: Joints of the one arm, or empty for the present ones.
+            start: Joints, or empty for the present ones.
             scale: Velocity scale.
             stopped: Whether the request was cancelled.
             estimates: Boxes of the request: what the map shows of them is theirs.
@@ -114,7 +116,8 @@ class PlanningContext:
             OpenArmError: from `Arm.start_state`, `PlanningScene.require` and `MapView.read`; NOT_READY without joints.
         """
         self._scene.require(expected)
-        parts = [self.start(arm, start, scale, stopped) for arm in arms]
+        starts = np.split(np.asarray(start), np.cumsum([arm.kinematics.n for arm in arms])[:-1])
+        parts = [self.start(arm, part, scale, stopped) for arm, part in zip(arms, starts, strict=True)]
         now = replace(parts[0], start=np.concatenate([part.start for part in parts]))
         uncertain = list(estimates)
         for arm, part, boxes in zip(arms, parts, attached, strict=True):
@@ -123,9 +126,10 @@ class PlanningContext:
         later = {**now.state, **ends}
         solids = (*self._scene.solids, *self._others_hold(arms, later))
         view, config, clearance = self.map_state(), self._config.map, _NEXT_TO if ends else 0.0
+        octree = self._scene.octree
 
         def complete() -> StartState:
-            occupied = view.occupied
+            occupied = view.occupied if octree is None else octree.beside(view.occupied, *self._reach())
             if occupied is not None:
                 certain, robot = (*self._scene.fixed, *solids), arms[0].description  # with what is mounted on it
                 occupied = unexplained(occupied, config, robot, now.state, certain, uncertain)
@@ -161,6 +165,12 @@ class PlanningContext:
         """Wait a moment for a fresh joint state; see `Watch.fresh`."""
         if self._robot.state_age() > self._config.execution.stale_after:
             await Watch(self._robot).fresh()
+
+    def _reach(self) -> tuple[Array, Array]:
+        """Two corners (3,) of a box about all that the arms, and what they hold, can meet; base frame, m."""
+        shoulders = np.array([arm.kinematics.placements[0, :3, 3] for arm in self._arms.values()])
+        reach = np.array([[arm.kinematics.reach + _BEYOND] for arm in self._arms.values()])
+        return (shoulders - reach).min(axis=0), (shoulders + reach).max(axis=0)
 
     def _others_hold(self, arms: Sequence[Arm], state: Mapping[str, float]) -> list[Box]:
         """What the other arms hold, where they hold it in a state."""

@@ -24,7 +24,7 @@ from openarm_motion.collision.solids import Box, Solid, box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.constraints.asked import CartesianGoal, RegionGoal
 from openarm_motion.constraints.cartesian import along
-from openarm_motion.constraints.plans import to_region
+from openarm_motion.constraints.plans import reaching, to_region
 from openarm_motion.planning import moves
 from openarm_motion.planning.alternative import explained, explained_approach, near_joints, near_pose
 from openarm_motion.planning.approach import ApproachPlan, plan_approach
@@ -80,8 +80,8 @@ _STRATEGIES: dict[Strategy, Callable[[DualArm, StartState, DualArmGoals, float],
 EMPTY: Mapping[str, float] = MappingProxyType({})
 
 
-def _with(now: StartState, state: Mapping[str, float]) -> StartState:
-    return replace(now, state={**now.state, **state}) if state else now
+def _with(now: StartState, state: Mapping[str, float], attempts: int = 1) -> StartState:
+    return replace(now, state={**now.state, **state}, seeds=range(attempts))
 
 
 def silent(stage: str, progress: float) -> None:
@@ -208,13 +208,14 @@ class MotionService:
                 held, holding = self.memory.on_request(arm.name, request.attached, request.hand_empty)
                 around = moves.RequestBoxes(request.obstacles, held)
                 await self._context.fresh()
-                start = self._start(arm, request.state)
+                start = self._start([arm], request.state)
                 prepared = self._context.prepare(
                     [arm], start, request.scale, stopped, request.obstacles, [held], request.scene_version
                 )
                 answer = replace(answer, scene_version=prepared.version)
                 planner = self._planner(arm, request.goal, around)
-                trajectory = await self.robot.compute(lambda: planner(_with(prepared.complete(), request.state)))
+                begun = lambda: _with(prepared.complete(), request.state, request.attempts)  # noqa: E731
+                trajectory = await self.robot.compute(lambda: planner(begun()))
                 message = f"planned, {trajectory.duration:.2f} s{prepared.note}{holding}"
                 answer = replace(answer, trajectory=trajectory, planning_time=self.robot.now() - begin, message=message)
                 self.on_plan({arm.name: (trajectory,)})
@@ -233,23 +234,24 @@ class MotionService:
         """Plan, and unless it is `plan_only` execute, a dual-arm motion; arguments as `plan_approach`."""
         answer = MoveArmsAnswer()
         try:
-            arms, stopped = self._two_arms(request.targets), self._stopped(cancelled)
+            arms, stopped = self._two_arms(request.arms), self._stopped(cancelled)
             with self.claims.holding(*(arm.name for arm in arms), wanted=not request.plan_only):
                 report("planning", 0.0)
                 begin = self.robot.now()
                 held = [self.memory.on_request(t.arm, t.attached, t.hand_empty)[0] for t in request.targets]
                 await self._context.fresh()
+                start = self._start(arms, request.state)
                 prepared = self._context.prepare(
-                    arms, (), request.scale, stopped, request.obstacles, held, request.scene_version
+                    arms, start, request.scale, stopped, request.obstacles, held, request.scene_version
                 )
                 answer = replace(answer, scene_version=prepared.version)
                 both = DualArm(*arms)
                 starts = both.parts(prepared.now.start)
                 find = [self._goals(a, q, t) for a, q, t in zip(arms, starts, request.targets, strict=True)]
-                limit = self.config.planning.time_limit
+                limit = request.time_limit or self.config.planning.time_limit
 
                 def work() -> DualArmPlan:
-                    now = prepared.complete()
+                    now = _with(prepared.complete(), request.state, request.attempts)
                     wanted = DualArmGoals((find[0](now), find[1](now)), request.obstacles, (held[0], held[1]))
                     return _STRATEGIES[request.strategy](both, now, wanted, limit)
 
@@ -287,6 +289,23 @@ class MotionService:
             return MotionAnswer(error, error.message)
         return MotionAnswer(message="arrived", start_delay=delay)
 
+    async def execute_arms(
+        self, motions: Mapping[str, Motion], cancelled: Callable[[], bool] = never, report: Report = silent
+    ) -> MotionAnswer:
+        """Execute trajectories of one arm, or of two at the same moment, by name; arguments as `plan_approach`."""
+        if len(motions) == 1:
+            return await self.execute(ExecuteRequest(*next(iter(motions.items()))), cancelled, report)
+        try:
+            arms = self._two_arms(list(motions))
+            with self.claims.holding(*motions, wanted=True):
+                await self._context.fresh()
+                await self.coordination.follow_together(
+                    arms, list(motions.values()), self._stopped(cancelled), lambda share: report("executing", share)
+                )
+        except OpenArmError as error:
+            return MotionAnswer(error, error.message)
+        return MotionAnswer(message="arrived")
+
     async def hold(self, limit: float) -> None:
         """End all plans and motions; the arms hold where they are, within `limit` s."""
         self.closing = True
@@ -318,7 +337,7 @@ class MotionService:
         arm = self._arm(arm_name)
         held, _ = self.memory.on_request(arm.name, (), False)
         await self._context.fresh()
-        prepared = self._context.prepare([arm], self._start(arm, state), 0.0, self._stopped(never), (), [held])
+        prepared = self._context.prepare([arm], self._start([arm], state), 0.0, self._stopped(never), (), [held])
         now = _with(await self.robot.compute(prepared.complete), state)
         return arm, now, moves.RequestBoxes((), held)
 
@@ -407,15 +426,16 @@ class MotionService:
         return paths
 
     # --- parts of these
-    def _start(self, arm: Arm, state: Mapping[str, float]) -> Sequence[float]:
-        """Joints of the arm where some are given in place of the present ones; empty for the present ones."""
-        if not any(name in state for name in arm.names):
+    def _start(self, arms: Sequence[Arm], state: Mapping[str, float]) -> Sequence[float]:
+        """Joints of the arms where some are given in place of the present ones; empty for the present ones."""
+        names = [name for arm in arms for name in arm.names]
+        if not any(name in state for name in names):
             return ()
         present = self.robot.states.latest()[1]
-        missing = [name for name in arm.names if name not in state and name not in present]
+        missing = [name for name in names if name not in state and name not in present]
         if missing:
             raise OpenArmError(Code.NOT_READY, f"neither the request nor /joint_states has {', '.join(missing)}")
-        return [state[name] if name in state else present[name] for name in arm.names]
+        return [state[name] if name in state else present[name] for name in names]
 
     async def _follow(
         self, arm: Arm, motion: Motion, cancelled: Callable[[], bool], report: Report, max_delay: float
@@ -457,12 +477,13 @@ class MotionService:
             return lambda _: named_posture(arm, goal.name, start)[None]
         if isinstance(goal, YieldGoal):
             return lambda _: yielding(arm, start, goal.name)
+        if isinstance(goal, RegionGoal):
+            return lambda now: reaching(arm, now, start, goal)
         pose, free = self.in_base(goal.pose, goal.frame), goal.position_only
         return lambda now: goal_configurations(arm, now, start, pose, position_only=free)
 
-    def _two_arms(self, targets: Sequence[ArmGoal]) -> tuple[Arm, Arm]:
+    def _two_arms(self, names: Sequence[str]) -> tuple[Arm, Arm]:
         self._follow_lift()
-        names = [target.arm for target in targets]
         if len(names) != 2 or len(set(names)) != 2 or any(name not in self.arms for name in names):
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,

@@ -62,7 +62,7 @@ class YieldGoal:
 
 
 Goal: TypeAlias = JointGoal | NamedGoal | PoseGoal | LineGoal | RegionGoal | CartesianGoal
-DualGoal: TypeAlias = JointGoal | NamedGoal | PoseGoal | YieldGoal
+DualGoal: TypeAlias = JointGoal | NamedGoal | PoseGoal | YieldGoal | RegionGoal
 Strategy = Literal["any", "together", "staggered"]
 
 
@@ -103,6 +103,7 @@ class MoveRequest:
         max_start_delay: Longest wait for clearance next to an arm under way, s.
         scene_version: That the planning scene must have; 0: any.
         state: Positions of joints, by name, that are taken in place of the present ones.
+        attempts: Paths that are searched for, of which the one that is followed soonest is taken.
     """
 
     arm: str
@@ -115,11 +116,17 @@ class MoveRequest:
     max_start_delay: float = 0.0
     scene_version: int = 0
     state: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    attempts: int = 1
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Name of the arm."""
+        return (self.arm,)
 
 
 @dataclass(frozen=True, eq=False)
 class ArmGoal:
-    """Goal of one arm of a dual-arm motion; `attached` and `hand_empty` as in `MoveRequest`."""
+    """Goal of one arm of a dual-arm motion, on a free path; `attached` and `hand_empty` as in `MoveRequest`."""
 
     arm: str
     goal: DualGoal
@@ -129,14 +136,26 @@ class ArmGoal:
 
 @dataclass(frozen=True, eq=False)
 class MoveArmsRequest:
-    """Plan, and unless `plan_only` execute, a dual-arm motion; attributes as in `MoveRequest`."""
+    """Plan, and unless `plan_only` execute, a dual-arm motion; attributes as in `MoveRequest`.
+
+    Attributes:
+        time_limit: Of the search, s; 0: the default.
+    """
 
     targets: tuple[ArmGoal, ...]
     strategy: Strategy = "any"
     obstacles: tuple[Box, ...] = ()
-    scale: float = 0.0
+    scale: Scale = 0.0
     plan_only: bool = False
     scene_version: int = 0
+    state: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    attempts: int = 1
+    time_limit: float = 0.0
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Names of the arms."""
+        return tuple(target.arm for target in self.targets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +166,11 @@ class ExecuteRequest:
     motion: Motion
     max_start_delay: float = 0.0
     scene_version: int = 0
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Name of the arm."""
+        return (self.arm,)
 
 
 # --- answers
@@ -209,6 +233,11 @@ class MoveArmsAnswer(MotionAnswer):
     """A planned, and maybe executed, dual-arm motion."""
 
     plan: DualArmPlan | None = None
+
+    @property
+    def trajectory(self) -> Trajectory | None:
+        """Of the joints of both arms."""
+        return None if self.plan is None else self.plan.whole
 
 
 @dataclass(frozen=True, eq=False)

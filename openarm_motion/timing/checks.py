@@ -6,7 +6,7 @@ s, rad, rad/s.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -87,13 +87,16 @@ def check_trajectory(arm: Arm, motion: Motion, state: Mapping[str, float]) -> Mo
     return Motion(arm.names, t, q, None if v is None else v[:, order], None if a is None else a[:, order])
 
 
-def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float]) -> None:
-    """Refuse a motion during which the arm would meet another arm at rest.
+def check_against_others(
+    arm: Arm, motion: Motion, state: Mapping[str, float], beside: Sequence[tuple[Arm, Motion]] = ()
+) -> None:
+    """Refuse a motion during which the arm would meet another arm, at rest or moving with it.
 
     Args:
         arm: The arm that is to move.
         motion: Its motion, beginning now.
         state: Present positions by joint name.
+        beside: Other arms with their motions, which begin now, too; those that are left out are at rest.
 
     Raises:
         OpenArmError: IN_COLLISION, with the pair and the time.
@@ -102,14 +105,15 @@ def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float]) -
     scene = CollisionScene(arm.robot, CollisionContext(state=state, clearance=keep, own=False))
     if scene.relax(motion.q[0], arm.config.planning.start_overlap) is not None:
         return  # it is in contact already: any way out is better than none, and the plan has checked it
-    for t in np.linspace(0.0, motion.duration, max(2, int(np.ceil(motion.duration / _PAIR_STEP)) + 1)):
+    duration = max(motion.duration, *(other.duration for _, other in beside), 0.0)
+    hint = "plan the arms together" if beside else "wait until the other arm is out of the way"
+    for t in np.linspace(0.0, duration, max(2, int(np.ceil(duration / _PAIR_STEP)) + 1)):
         q = np.array([motion.joints_at(float(t))[name] for name in arm.names])
+        for other, its in beside:
+            scene.put_other(other.robot, its.states(np.array([t]))[0])
         if scene.collides(q):
             contact = scene.contacts(q)[0]
-            raise OpenArmError(
-                Code.IN_COLLISION,
-                f"{arm.name} arm after {t:.1f} s: {contact}; wait until the other arm is out of the way",
-            )
+            raise OpenArmError(Code.IN_COLLISION, f"{arm.name} arm after {t:.1f} s: {contact}; {hint}")
 
 
 def _invalid(arm: Arm, fault: str) -> OpenArmError:

@@ -83,6 +83,12 @@ class Motion:
             return np.asarray(CubicHermiteSpline(self.t, self.q, self.v)(np.clip(times, self.t[0], self.t[-1])))
         return np.stack([np.interp(times, self.t, column) for column in self.q.T], axis=1)
 
+    def of(self, names: tuple[str, ...]) -> Motion:
+        """The motion of some of its joints."""
+        k = [self.names.index(name) for name in names]
+        v, a = (None if x is None else x[:, k] for x in (self.v, self.a))
+        return Motion(names, self.t, self.q[:, k], v, a)
+
     def later(self, seconds: float) -> Motion:
         """The same, begun later; the arm rests before."""
         return replace(self, t=self.t + seconds)

@@ -185,8 +185,8 @@ def test_a_state_is_judged_by_contacts_and_constraints(T: np.ndarray, arm, now) 
 
 def test_groups_and_links_are_those_of_the_description(arm, arms) -> None:
     names = RobotNames(arm.description, arms)
-    assert names.groups() == {"left_arm": "left", "right_arm": "right"}
+    assert names.groups() == {"left_arm": ("left",), "right_arm": ("right",), "both_arms": ("left", "right")}
     assert set(names.hands()) == {"left_gripper", "right_gripper"}
     assert arm.kinematics.tool_link in names.links_on_tool("right")
     assert names.on_tool("right", "") == pytest.approx(np.eye(4))
-    refused("planning groups: left_arm, right_arm", names.arm_of_group, "both_arms")
+    refused("planning groups: left_arm, right_arm, both_arms", names.arms_of_group, "no_such_group")

@@ -18,7 +18,6 @@ from openarm_motion.planning.dual_arm import (
     DualArmGoals,
     DualArmPlan,
     delayed,
-    joined,
     plan_staggered,
     plan_together,
     separation,
@@ -46,7 +45,7 @@ def starting(both: DualArm, state: dict[str, float]) -> StartState:
 
 def apart_all_the_way(both: DualArm, state: dict[str, float], plan: DualArmPlan) -> float:
     """Least distance of the arms at looks 5 ms apart, from nothing but the trajectories."""
-    whole = joined(both, plan.trajectories)
+    whole = plan.whole
     scene = both.scene(state)
     states = whole.at(np.arange(0.0, whole.duration, 0.005))[0]
     return min(scene.separation(q) for q in states[::3])
@@ -95,8 +94,8 @@ def test_the_arm_in_the_way_goes_first_and_the_other_waits_no_longer_than_it_mus
     moving = replace(late, t=late.t[1:] - plan.start_delays[1], q=late.q[1:], v=late.v[1:], a=late.a[1:])
     scene = both.scene(state)
     sooner = delayed(moving, plan.start_delays[1] - 0.1)
-    assert separation(scene, joined(both, (plan.trajectories[0], sooner))) < 0.024
-    assert separation(scene, joined(both, plan.trajectories)) >= 0.024
+    assert separation(scene, replace(plan, trajectories=(plan.trajectories[0], sooner)).whole) < 0.024
+    assert separation(scene, plan.whole) >= 0.024
     assert apart_all_the_way(both, state, plan) >= 0.020
 
 
@@ -133,7 +132,7 @@ def test_an_obstacle_of_the_second_arm_is_seen(both, home) -> None:
 
 def test_separation_is_that_of_every_look(both, home) -> None:
     state, goals = swapping(both, home)
-    whole = joined(both, plan_together(both, starting(both, state), goals, 10.0).trajectories)
+    whole = plan_together(both, starting(both, state), goals, 10.0).whole
     scene = both.scene(state)
     every = min(scene.separation(q) for q in whole.at(dense_times(whole, scene.levers, 0.004))[0])
     assert separation(scene, whole) == pytest.approx(every, abs=1e-9)

@@ -84,6 +84,25 @@ class Converter:
                 tuple(self._orientation(part, arm) for part in message.orientation_constraints),
             )
 
+    def regions(self, message: Constraints, arms: Sequence[str]) -> tuple[Region, ...]:
+        """The region of each of the arms of a group; what a constraint is of says which arm it is for.
+
+        Raises:
+            MoveItError: as `region`.
+        """
+        if len(arms) == 1:
+            return (self.region(message, arms[0]),)
+        parts = {arm: Constraints() for arm in arms}
+        with as_moveit(MoveItErrorCodes.INVALID_GOAL_CONSTRAINTS):
+            for joint in message.joint_constraints:
+                parts[self._names.arm_of_joint(joint.joint_name, arms)].joint_constraints.append(joint)
+        with as_moveit(MoveItErrorCodes.INVALID_LINK_NAME):
+            for place in message.position_constraints:
+                parts[self._names.arm_of_link(place.link_name, arms)].position_constraints.append(place)
+            for turn in message.orientation_constraints:
+                parts[self._names.arm_of_link(turn.link_name, arms)].orientation_constraints.append(turn)
+        return tuple(self.region(part, arm) for arm, part in parts.items())
+
     def on_tool(self, arm: str, link: str) -> Array:
         """Pose of a link in the frame of an arm's tool.
 
@@ -103,7 +122,7 @@ class Converter:
             _volume(shape, self.pose(pose, message.header.frame_id)) for shape, pose in zip(shapes, poses, strict=True)
         ]
         p = T[:3, 3] + T[:3, :3] @ xyz(message.target_point_offset)
-        return PositionRegion(message.link_name, p, tuple(volumes))
+        return PositionRegion(message.link_name, p, tuple(volumes), _weight(message.weight, message.link_name))
 
     def _orientation(self, message: OrientationConstraint, arm: str) -> OrientationRegion:
         T = self.on_tool(arm, message.link_name)
@@ -120,7 +139,8 @@ class Converter:
             text = f"parameterization is {message.parameterization}; valid: XYZ_EULER_ANGLES 0, ROTATION_VECTOR 1"
             raise OpenArmError(Code.INVALID_ARGUMENT, text)
         vector = message.parameterization == message.ROTATION_VECTOR
-        return OrientationRegion(message.link_name, T[:3, :3], R, tolerance, vector)
+        weight = _weight(message.weight, message.link_name)
+        return OrientationRegion(message.link_name, T[:3, :3], R, tolerance, vector, weight)
 
     # --- states
     def state(self, message: RobotState) -> dict[str, float]:
@@ -176,7 +196,15 @@ class Converter:
 
 
 def _interval(message: JointConstraint) -> JointInterval:
-    return JointInterval(message.joint_name, message.position, message.tolerance_above, message.tolerance_below)
+    name, weight = message.joint_name, _weight(message.weight, message.joint_name)
+    return JointInterval(name, message.position, message.tolerance_above, message.tolerance_below, weight)
+
+
+def _weight(given: float, name: str) -> float:
+    """The weight of a constraint of a joint or link; 0 is 1, as in MoveIt."""
+    if not 0.0 <= given < np.inf:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"constraint of {name}: weight is {given:g}, expected a number >= 0")
+    return given or 1.0
 
 
 def _volume(shape: SolidPrimitive, T: Array) -> Volume:

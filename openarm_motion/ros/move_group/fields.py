@@ -79,6 +79,7 @@ SCENE: tuple[str, ...] = (
     *("name", "robot_model_name", "allowed_collision_matrix.*", "object_colors.*", "is_diff"),
     *_under("robot_state", _HELD_STATE),
     *_under("world.collision_objects", OBJECT),
+    *_under("world.octomap", ("header.*", "origin.*", "octomap.*")),
 )
 
 

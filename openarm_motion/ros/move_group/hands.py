@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from openarm_common.ros.actions import ActionClient
 from openarm_common.ros.node import BaseNode
 from openarm_motion.config import MoveGroupConfig
 from openarm_motion.ros.move_group.codes import MoveItError
+from openarm_motion.service.robot import Watch
 from openarm_motion.timing.trajectory import Motion
 
 if TYPE_CHECKING:
@@ -62,11 +63,15 @@ class Hands:
         fingers = {arm: self._description.finger_joint(arm) for arm in self._clients}
         return next((arm for arm, f in fingers.items() if f in names and set(names) <= self._followers(f)), "")
 
+    def joints(self, arm: str) -> dict[str, tuple[str, ...]]:
+        """Return the joint of an arm's fingers by the arm."""
+        return {arm: (self._description.finger_joint(arm),)}
+
     def plan(self, message: MotionPlanRequest) -> Motion:
-        """A straight motion of the fingers to the joint goal of a request.
+        """A straight motion of the fingers to the joint goal of a request, which is one that any group supports.
 
         Raises:
-            OpenArmError: for any other kind of goal; LIMITS; INVALID_ARGUMENT, for a velocity scale that is none.
+            OpenArmError: for any other kind of goal, and for path constraints; LIMITS; NOT_READY.
         """
         arm = self.groups[message.group_name]
         finger = self._description.finger_joint(arm)
@@ -77,11 +82,16 @@ class Hands:
             text = f"the goal of group {message.group_name!r} must be joint constraints of {finger!r} alone"
             raise MoveItError(MoveItErrorCodes.INVALID_GOAL_CONSTRAINTS, text)
         position = next((j.position for j in joints if j.joint_name == finger), joints[0].position)
+        path = message.path_constraints
+        if path.joint_constraints or path.position_constraints or path.orientation_constraints:
+            text = f"path_constraints: group {message.group_name!r} goes straight to its goal, expected none"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
         limits = self._description.joint(finger)
         if not limits.lower - 1e-6 <= position <= limits.upper + 1e-6:
             text = f"{finger} is to go to {position:g}, limits {limits.lower:g} to {limits.upper:g}"
             raise OpenArmError(Code.LIMITS, text)
-        state = self._service.robot.states.latest()[1]
+        given = message.start_state.joint_state
+        state = {**self._service.robot.states.latest()[1], **dict(zip(given.name, given.position, strict=False))}
         if finger not in state:
             raise OpenArmError(Code.NOT_READY, f"/joint_states lacks {finger}")
         ends = np.array([[state[finger]], [position]])
@@ -89,11 +99,11 @@ class Hands:
         duration = max(_SHORTEST, float(np.ptp(ends)) / (self._config.finger_speed * share))
         return Motion((finger,), np.array([0.0, duration]), ends, np.zeros((2, 1)), np.zeros((2, 1)))
 
-    async def execute(self, arm: str, motion: Motion) -> None:
+    async def execute(self, arm: str, motion: Motion, stopped: Callable[[], bool]) -> None:
         """Send the fingers to the end of a motion; what stops them before that is held, which is no failure.
 
         Raises:
-            OpenArmError: NOT_READY or EXECUTION_FAILED.
+            OpenArmError: NOT_READY, EXECUTION_FAILED or CANCELLED.
         """
         finger = self._description.finger_joint(arm)
         position = float(motion.q[-1][motion.names.index(finger)])
@@ -109,7 +119,13 @@ class Hands:
         handle: Any = await client.send_goal_async(goal)
         if not handle.accepted:
             raise OpenArmError(Code.EXECUTION_FAILED, f"{client.name} rejected the position {position:g} of {finger}")
-        result = (await handle.get_result_async()).result
+        ended = handle.get_result_async()
+        await Watch(self._service.robot).until(lambda: ended.done() or stopped())
+        if not ended.done():
+            await handle.cancel_goal_async()
+        result = (await ended).result
+        if stopped():
+            raise OpenArmError(Code.CANCELLED, f"cancelled; the {arm} hand holds where it is")
         if not (result.reached_goal or result.stalled):
             raise OpenArmError(Code.EXECUTION_FAILED, f"{client.name}: the fingers neither arrived nor met anything")
 

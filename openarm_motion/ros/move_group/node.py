@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -54,10 +55,13 @@ from openarm_motion.constraints.names import RobotNames
 from openarm_motion.constraints.queries import at_pose, judge, link_poses, solve
 from openarm_motion.ros.move_group.codes import error_code
 from openarm_motion.ros.move_group.convert import Converter, as_moveit, state_msg, trajectory_msg
-from openarm_motion.ros.move_group.fields import FK, IK, MOVE, VALIDITY, check_fields
+from openarm_motion.ros.move_group.fields import EXECUTE, FK, IK, MOVE, VALIDITY, check_fields
 from openarm_motion.ros.move_group.hands import Hands
+from openarm_motion.ros.move_group.octomap import SceneOctomap
 from openarm_motion.ros.move_group.planning import PIPELINE, Requests
 from openarm_motion.ros.move_group.scene import SceneServer
+from openarm_motion.ros.move_group.turns import Turns
+from openarm_motion.service.requests import MoveRequest
 from openarm_motion.timing.trajectory import Motion
 
 if TYPE_CHECKING:
@@ -100,8 +104,9 @@ class MoveGroupNode(BaseNode[NoParameters]):
         self._requests = Requests(service, names, self._convert)
         self._hands = Hands(self, config, service, robot, names)
         self._refused = ("", "")
-        self._stops = 0
-        self.scene = SceneServer(self, service, robot, names, self._convert, self._requests, self.on_scene)
+        self._stops, self._turns = 0, Turns(service.robot)
+        octomap = SceneOctomap(self, service, self._convert, config.map)
+        self.scene = SceneServer(self, service, robot, names, self._convert, self._requests, octomap, self.on_scene)
         self._display = self.create_publisher(DisplayTrajectory, "/display_planned_path", QOS_LATCHED)
         semantic = self.create_publisher(String, "/robot_description_semantic", QOS_LATCHED)
         semantic.publish(String(data=robot.srdf))
@@ -137,11 +142,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
         answer = MotionPlanResponse()
         try:
             check_fields(goal, MOVE, "goal of /move_action")
-            execute = not goal.planning_options.plan_only
-            motion = await self._move(goal.request, answer, handle, execute=execute)
-            if goal.request.group_name in self._hands.groups and execute and motion is not None:
-                self._check_hold(self._hands.groups[goal.request.group_name], bytes(handle.goal_id.uuid))
-                await self._hands.execute(self._hands.groups[goal.request.group_name], motion)
+            await self._move(goal.request, answer, handle, execute=not goal.planning_options.plan_only)
         except OpenArmError as error:
             self._refuse("/move_action", error, answer)
         self._end(handle, answer.error_code.val == answer.error_code.SUCCESS)
@@ -157,23 +158,32 @@ class MoveGroupNode(BaseNode[NoParameters]):
         result = ExecuteTrajectory.Result()
         try:
             names = list(handle.request.trajectory.joint_trajectory.joint_names)
-            if arm := self._hands.of_joints(names):
-                self._check_hold(arm, bytes(handle.goal_id.uuid))
+            if hand := self._hands.of_joints(names):
+                check_fields(handle.request, EXECUTE, "trajectory")
                 names, t, q, _, _ = trajectory_from_msg(handle.request.trajectory.joint_trajectory)
-                await self._hands.execute(arm, Motion(tuple(names), t, q))
+                async with self._turn(handle, {hand: names}) as stopped:
+                    await self._hands.execute(hand, Motion(tuple(names), t, q), stopped)
             else:
-                request = self._requests.execute(handle.request, lambda arm: self._controller.format(arm=arm))
-                self._check_hold(request.arm, bytes(handle.goal_id.uuid))
-                (await self._service.execute(request, self._cancelled(handle))).require()
+                motions = self._requests.execute(handle.request, lambda arm: self._controller.format(arm=arm))
+                async with self._turn(handle, {arm: motion.names for arm, motion in motions.items()}) as stopped:
+                    (await self._service.execute_arms(motions, stopped)).require()
             result.error_code = error_code(None, "arrived")
         except OpenArmError as error:
             self._refuse("/execute_trajectory", error, result)
         self._end(handle, result.error_code.val == result.error_code.SUCCESS)
         return result
 
-    def _cancelled(self, handle: ServerGoalHandle) -> Callable[[], bool]:
+    def _turn(
+        self, handle: ServerGoalHandle | None, moved: Mapping[str, Sequence[str]]
+    ) -> AbstractAsyncContextManager[Callable[[], bool]]:
+        """The turn of a goal, or of a service, that moves joints of some arms."""
         stops = self._stops
-        return lambda: bool(handle.is_cancel_requested) or self._stops != stops
+        if handle is not None:
+            for arm in moved:
+                self._check_hold(arm, bytes(handle.goal_id.uuid))
+        joints = [name for names in moved.values() for name in names]
+        ended = lambda: handle is not None and (bool(handle.is_cancel_requested) or self._stops != stops)  # noqa: E731
+        return self._turns.take(joints, ended)
 
     def _end(self, handle: ServerGoalHandle, success: bool) -> None:
         if success:
@@ -205,26 +215,31 @@ class MoveGroupNode(BaseNode[NoParameters]):
         handle: ServerGoalHandle | None = None,
         *,
         execute: bool = False,
-    ) -> Motion | None:
+    ) -> None:
         """Plan, and execute; the answer is filled in as far as that goes."""
         answer.group_name = request.group_name
-        answer.trajectory_start = self._state(request.start_state)
-        if request.group_name in self._hands.groups:
-            motion: Motion | None = self._hands.plan(request)
-            answer.trajectory = trajectory_msg(motion)
-            answer.error_code = error_code(None, "planned")
-        else:
-            cancelled = self._cancelled(handle) if handle is not None else (lambda: False)
-            asked = self._requests.plan(request, execute=execute)
-            if handle is not None and execute:
-                self._check_hold(asked.arm, bytes(handle.goal_id.uuid))
-            reply = await self._service.move(asked, cancelled, self._reporter(handle))
-            motion, answer.planning_time = reply.trajectory, reply.planning_time
-            answer.trajectory = trajectory_msg(motion)
-            reply.require()
-            answer.error_code = error_code(None, reply.message)
+        self._requests.check(request)
+        hand, note = self._hands.groups.get(request.group_name, ""), self._requests.note(request, execute=execute)
+        asked = None if hand else self._requests.plan(request, execute=execute)
+        moved = {arm: self._service.arms[arm].names for arm in asked.arms} if asked else self._hands.joints(hand)
+        async with self._turn(handle, moved if execute else {}) as stopped:
+            answer.trajectory_start = self._state(RobotState() if execute else request.start_state)
+            if asked is None:
+                motion: Motion = self._hands.plan(request)
+                answer.trajectory = trajectory_msg(motion)
+                if execute:
+                    await self._hands.execute(hand, motion, stopped)
+                answer.error_code = error_code(None, f"{'arrived' if execute else 'planned'}{note}")
+            else:
+                report = self._reporter(handle)
+                if isinstance(asked, MoveRequest):
+                    reply = await self._service.move(asked, stopped, report)
+                else:
+                    reply = await self._service.move_arms(asked, stopped, report)
+                answer.trajectory, answer.planning_time = trajectory_msg(reply.trajectory), reply.planning_time
+                reply.require()
+                answer.error_code = error_code(None, reply.message + note)
         self.show(answer.trajectory_start, answer.trajectory)
-        return motion
 
     def _reporter(self, handle: ServerGoalHandle | None) -> Callable[[str, float], None]:
         said = {"PLANNING"}
@@ -307,11 +322,11 @@ class MoveGroupNode(BaseNode[NoParameters]):
     async def _on_validity(self, request: GetStateValidity.Request, response: GetStateValidity.Response) -> object:
         try:
             check_fields(request, VALIDITY, "request of /check_state_validity")
-            names = [self._requests.arm(request.group_name)] if request.group_name else list(self._service.arms)
+            names = self._requests.arms(request.group_name) if request.group_name else tuple(self._service.arms)
+            regions = self._convert.regions(request.constraints, names)
             state = self._convert.state(request.robot_state)
             response.valid = True
-            for name in names:
-                region = self._convert.region(request.constraints, name)
+            for name, region in zip(names, regions, strict=True):
                 arm, now, around = await self._service.surroundings(name, state)
                 verdict = await self._service.robot.compute(lambda a=(arm, now, around, region): judge(*a))
                 response.valid = response.valid and verdict.valid
@@ -347,6 +362,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
         return response
 
     async def _on_clear(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
+        await self.scene.clear_octomap()
         if self._map.service_is_ready():
             await self._map.call_async(Empty.Request())
         else:

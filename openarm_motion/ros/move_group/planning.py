@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from moveit_msgs.action import ExecuteTrajectory
@@ -20,7 +20,7 @@ from openarm_motion.ros.move_group.codes import MoveItError
 from openarm_motion.ros.move_group.convert import Converter, as_moveit
 from openarm_motion.ros.move_group.fields import CARTESIAN, EXECUTE, PLAN, check_fields
 from openarm_motion.scene.bodies import Body, boxes_about
-from openarm_motion.service.requests import ExecuteRequest, MoveRequest
+from openarm_motion.service.requests import ArmGoal, MoveArmsRequest, MoveRequest
 from openarm_motion.timing.trajectory import Motion
 
 if TYPE_CHECKING:
@@ -49,14 +49,13 @@ class Requests:
     def __init__(self, service: MotionService, names: RobotNames, convert: Converter) -> None:
         self._service, self._names, self._convert = service, names, convert
 
-    def plan(self, message: MotionPlanRequest, *, execute: bool = False) -> MoveRequest:
-        """What a plan request asks.
+    def check(self, message: MotionPlanRequest) -> None:
+        """Refuse what no group supports, and what makes no sense.
 
         Raises:
-            OpenArmError: for what is not supported, or makes no sense.
+            OpenArmError: INVALID_ARGUMENT, naming the field.
         """
         check_fields(message, PLAN, "plan request")
-        arm = self.arm(message.group_name)
         self._check_pipeline(message.pipeline_id, message.planner_id)
         self._check_workspace(message.workspace_parameters)
         limit = message.allowed_planning_time
@@ -65,16 +64,46 @@ class Requests:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"{text}, expected numbers >= 0 (0: the default), at most {_LONGEST:g} s"
             )
-        goals = tuple(region for part in message.goal_constraints if (region := self._convert.region(part, arm)))
+        self._scale(message)
+
+    def plan(self, message: MotionPlanRequest, *, execute: bool = False) -> MoveRequest | MoveArmsRequest:
+        """What a plan request, which `check` has passed, asks of the one arm or two of its group.
+
+        Raises:
+            OpenArmError: for what is not supported, or makes no sense.
+        """
+        arms = self.arms(message.group_name)
+        goals = [parts for one in message.goal_constraints if any(parts := self._convert.regions(one, arms))]
+        path = self._convert.regions(message.path_constraints, arms)
         if not goals:
             text = "goal_constraints has no constraint, expected at least one"
             raise MoveItError(MoveItErrorCodes.INVALID_GOAL_CONSTRAINTS, text)
-        path = self._convert.region(message.path_constraints, arm)
-        goal = RegionGoal(goals, path, limit)
-        state = self._convert.state(message.start_state)
-        held = self._held(message, arm)
-        scale = (message.max_velocity_scaling_factor, message.max_acceleration_scaling_factor)
-        return MoveRequest(arm, goal, attached=held, scale=scale, plan_only=not execute, state=self._given(state))
+        if len(arms) > 1 and (len(goals) > 1 or any(path)):
+            what = "path_constraints" if any(path) else f"goal_constraints has {len(goals)} alternatives, expected one"
+            text = f"{what}: not for a group of two arms; groups of one: {', '.join(self._single())}"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
+        limit, held = message.allowed_planning_time, self._held(message, arms)
+        asked = {arm: RegionGoal(tuple(g[k] for g in goals), path[k], limit) for k, arm in enumerate(arms)}
+        common: dict[str, Any] = {
+            "scale": self._scale(message),
+            "plan_only": not execute,
+            "state": {} if execute else self._given(self._convert.state(message.start_state)),
+            "attempts": max(message.num_planning_attempts, 1),
+        }
+        if len(arms) == 1:
+            return MoveRequest(arms[0], asked[arms[0]], attached=held[arms[0]], **common)
+        targets = tuple(ArmGoal(arm, goal, held[arm]) for arm, goal in asked.items())
+        return MoveArmsRequest(targets, time_limit=limit, **common)
+
+    def note(self, message: MotionPlanRequest, *, execute: bool) -> str:
+        """What the answer says of weights that differ, and of a start that is not where the robot is now."""
+        parts = [*message.goal_constraints, message.path_constraints]
+        found = [(p.joint_constraints, p.position_constraints, p.orientation_constraints) for p in parts]
+        weights = {one.weight or 1.0 for lists in found for constraints in lists for one in constraints}
+        said = ", ".join(f"{weight:g}" for weight in sorted(weights))
+        text = f"; every constraint is met, whatever its weight ({said})" if len(weights) > 1 else ""
+        elsewhere = execute and self._given(self._convert.state(message.start_state))
+        return f"{text}; it started where the arm was, not in start_state" if elsewhere else text
 
     def cartesian(self, message: GetCartesianPath.Request) -> MoveRequest:
         """What a request for a Cartesian path asks.
@@ -99,11 +128,10 @@ class Requests:
             self._convert.region(message.path_constraints, arm),
         )
         state = self._given(self._convert.state(message.start_state))
-        scale = (message.max_velocity_scaling_factor, message.max_acceleration_scaling_factor)
-        return MoveRequest(arm, goal, scale=scale, plan_only=True, state=state)
+        return MoveRequest(arm, goal, scale=self._scale(message), plan_only=True, state=state)
 
-    def execute(self, message: ExecuteTrajectory.Goal, controller: Callable[[str], str]) -> ExecuteRequest:
-        """What a goal of /execute_trajectory asks.
+    def execute(self, message: ExecuteTrajectory.Goal, controller: Callable[[str], str]) -> dict[str, Motion]:
+        """The motions, by arm, that a goal of /execute_trajectory asks for.
 
         Args:
             message: The goal.
@@ -114,26 +142,46 @@ class Requests:
         """
         check_fields(message, EXECUTE, "trajectory")
         names, t, q, v, a = trajectory_from_msg(message.trajectory.joint_trajectory)
-        arm = self._names.arm_of_joints(names)
-        if not arm:
-            arms = "; ".join(f"{name}: {', '.join(arm.names)}" for name, arm in self._service.arms.items())
-            text = f"a trajectory of joints {', '.join(names) or '(none)'}; expected those of one arm ({arms})"
+        arms = self._names.arms_of_joints(names)
+        if not arms:
+            known = "; ".join(f"{name}: {', '.join(arm.names)}" for name, arm in self._service.arms.items())
+            text = f"a trajectory of joints {', '.join(names) or '(none)'}; expected those of one arm or two ({known})"
             raise MoveItError(MoveItErrorCodes.INVALID_MOTION_PLAN, text)
-        there = controller(arm)
-        unknown = [name for name in message.controller_names if name != there]
+        there = [controller(arm) for arm in arms]
+        unknown = [name for name in message.controller_names if name not in there]
         if unknown:
-            text = f"controller_names has {unknown[0]!r}; the controller of the {arm} arm is {there!r}"
+            text = f"controller_names has {unknown[0]!r}; the joints are those of {', '.join(map(repr, there))}"
             raise MoveItError(MoveItErrorCodes.CONTROL_FAILED, text)
-        return ExecuteRequest(arm, Motion(tuple(names), t, q, v, a))
+        whole = Motion(tuple(names), t, q, v, a)
+        return {arm: whole if len(arms) == 1 else whole.of(self._service.arms[arm].names) for arm in arms}
 
-    def arm(self, group: str) -> str:
-        """The arm of a planning group.
+    def arms(self, group: str) -> tuple[str, ...]:
+        """The arm, or the two arms, of a planning group.
 
         Raises:
             MoveItError: INVALID_GROUP_NAME.
         """
         with as_moveit(MoveItErrorCodes.INVALID_GROUP_NAME):
-            return self._names.arm_of_group(group)
+            return self._names.arms_of_group(group)
+
+    def arm(self, group: str) -> str:
+        """The arm of a planning group; raises as `arms`, for a group of two arms, too."""
+        first, *others = self.arms(group)
+        if others:
+            text = f"group {group!r} has the joints of two arms; groups of one: {', '.join(self._single())}"
+            raise MoveItError(MoveItErrorCodes.INVALID_GROUP_NAME, text)
+        return first
+
+    def _single(self) -> list[str]:
+        return [group for group, arms in self._names.groups().items() if len(arms) == 1]
+
+    def _scale(self, message: MotionPlanRequest | GetCartesianPath.Request) -> tuple[float, float]:
+        """Scales of velocity and acceleration."""
+        names = ("max_velocity_scaling_factor", "max_acceleration_scaling_factor")
+        velocity, acceleration = (float(getattr(message, name)) for name in names)
+        for name, value in zip(names, (velocity, acceleration), strict=True):
+            next(iter(self._service.arms.values())).scale(value, name)
+        return velocity, acceleration
 
     def _given(self, state: dict[str, float]) -> dict[str, float]:
         """What a state says other than that the robot is where it is."""
@@ -144,13 +192,14 @@ class Requests:
             return {}
         return state
 
-    def _held(self, message: MotionPlanRequest, arm: str) -> tuple[Box, ...]:
-        """Boxes that the start state says the arm holds, tool frame."""
-        out: list[Box] = []
+    def _held(self, message: MotionPlanRequest, arms: Sequence[str]) -> dict[str, tuple[Box, ...]]:
+        """Boxes that the start state says each of the arms holds, tool frame."""
+        out: dict[str, tuple[Box, ...]] = dict.fromkeys(arms, ())
         for attached in message.start_state.attached_collision_objects:
             link, body = attached.link_name, attached.object
             with as_moveit(MoveItErrorCodes.INVALID_LINK_NAME):
-                if self._names.arm_of_link(link) != arm:
+                arm = self._names.arm_of_link(link)
+                if arm not in arms:
                     raise OpenArmError(Code.INVALID_ARGUMENT, f"{body.id!r} is attached to {link!r}, not of the group")
             self.check_touch(attached.touch_links, arm)
             T, shapes = self._convert.shapes(body)
@@ -160,8 +209,8 @@ class Requests:
             state = {**self._service.robot.states.latest()[1], **self._convert.state(message.start_state)}
             kinematics = self._service.arms[arm].kinematics
             T_base_tool = kinematics.fk(np.array([state[name] for name in kinematics.names]))
-            out += boxes_about(Body(body.id, T, shapes).moved(se3.inverse(T_base_tool)))
-        return tuple(out)
+            out[arm] += tuple(boxes_about(Body(body.id, T, shapes).moved(se3.inverse(T_base_tool))))
+        return out
 
     def check_touch(self, links: list[str], arm: str) -> None:
         """Refuse links that may not touch what a hand holds: those of the hand always may.

@@ -24,9 +24,11 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_common.types import Array
+from openarm_motion.collision.occupancy import MAP
 from openarm_motion.ros.move_group.codes import MoveItError
 from openarm_motion.ros.move_group.convert import Converter, as_moveit, object_msg, state_msg
 from openarm_motion.ros.move_group.fields import ATTACHED, OBJECT, SCENE, check_fields
+from openarm_motion.ros.move_group.octomap import SceneOctomap
 from openarm_motion.scene.bodies import Body, Draft, SceneBodies
 
 if TYPE_CHECKING:
@@ -37,6 +39,8 @@ if TYPE_CHECKING:
 #: A state in a scene that is further than this from where the robot is asks for another one, rad.
 _PRESENT = 0.05
 _ALL = 2 * Components.OBJECT_COLORS - 1
+#: MoveIt's name of the map in allowed collisions.
+_OCTOMAP = "<octomap>"
 
 
 class SceneServer:
@@ -49,6 +53,7 @@ class SceneServer:
         names: Of its links.
         convert: Messages to core data.
         requests: Checks what hands may touch.
+        octomap: Of the scene.
         on_change: Called when the scene has changed.
     """
 
@@ -60,13 +65,13 @@ class SceneServer:
         names: RobotNames,
         convert: Converter,
         requests: Requests,
+        octomap: SceneOctomap,
         on_change: Callable[[], None],
     ) -> None:
         self._node, self._service, self._description, self._names = node, service, description, names
-        self._convert, self._requests, self._on_change = convert, requests, on_change
+        self._convert, self._requests, self._octomap, self._on_change = convert, requests, octomap, on_change
         self._bodies = SceneBodies(service)
         self._colors: dict[str, ObjectColor] = {}
-        self._shown = 0
         self._monitored = node.create_publisher(PlanningScene, "/monitored_planning_scene", QOS_COMMAND)
         node.create_service(GetPlanningScene, "/get_planning_scene", self._on_get)
         node.create_service(ApplyPlanningScene, "/apply_planning_scene", self._on_apply)
@@ -76,15 +81,12 @@ class SceneServer:
         node.create_timer(node.REPORT_PERIOD_S, self._show, clock=node.steady_clock)
 
     # --- questions
-    def _on_get(self, request: GetPlanningScene.Request, response: GetPlanningScene.Response) -> object:
-        response.scene = self.message(request.components.components or _ALL)
+    async def _on_get(self, request: GetPlanningScene.Request, response: GetPlanningScene.Response) -> object:
+        response.scene = await self.message(request.components.components or _ALL)
         return response
 
-    def message(self, components: int = _ALL) -> PlanningScene:
-        """The scene, as far as it is asked for.
-
-        Without an octree, which the map's own topics have, and without what can't be removed: the table.
-        """
+    async def message(self, components: int = _ALL) -> PlanningScene:
+        """The scene, as far as it is asked for, without what can't be removed: the table."""
         scene = PlanningScene(name="openarm", robot_model_name=self._description.name)
         scene.robot_state.is_diff = True
         base = self._description.base
@@ -108,12 +110,14 @@ class SceneServer:
             scene.allowed_collision_matrix = self._matrix()
         if components & Components.OBJECT_COLORS:
             scene.object_colors = [color for id, color in self._colors.items() if id in self._bodies.world]
+        if components & Components.OCTOMAP:
+            scene.world.octomap = await self._octomap.message()
         return scene
 
     def _entry_names(self) -> list[str]:
         links = [link.name for link in self._description.links.values() if link.collision]
         fixed = [solid.id for solid in self._service.scene.fixed]
-        return [*links, *fixed, *self._bodies.world, *self._bodies.held]
+        return [*links, *fixed, *self._bodies.world, *self._bodies.held, MAP]
 
     def _matrix(self) -> AllowedCollisionMatrix:
         known = self._entry_names()
@@ -126,25 +130,32 @@ class SceneServer:
             if a in index and b in index:
                 grid[index[a], index[b]] = grid[index[b], index[a]] = True
         return AllowedCollisionMatrix(
-            entry_names=names, entry_values=[AllowedCollisionEntry(enabled=row) for row in grid.tolist()]
+            entry_names=[_OCTOMAP if name == MAP else name for name in names],
+            entry_values=[AllowedCollisionEntry(enabled=row) for row in grid.tolist()],
         )
 
     # --- changes
-    def _on_apply(self, request: ApplyPlanningScene.Request, response: ApplyPlanningScene.Response) -> object:
+    async def _on_apply(self, request: ApplyPlanningScene.Request, response: ApplyPlanningScene.Response) -> object:
         try:
-            self._change(request.scene)
+            await self._change(request.scene)
             response.success = True
         except OpenArmError as error:
             self._node.get_logger().error(f"/apply_planning_scene refused: {error}")
             self._node.diagnose_warning(f"/apply_planning_scene refused: {error.message}")
         return response
 
-    def _change(self, scene: PlanningScene) -> None:
+    async def clear_octomap(self) -> None:
+        """Take a client's octomap out of the scene."""
+        self._service.scene.see(None)
+        await self._show()
+
+    async def _change(self, scene: PlanningScene) -> None:
         check_fields(scene, SCENE, "planning scene")
         if scene.robot_model_name not in ("", self._description.name):
             text = f"robot_model_name is {scene.robot_model_name!r}, expected {self._description.name!r}"
             raise MoveItError(MoveItErrorCodes.INVALID_ROBOT_STATE, text)
         self._check_state(scene)
+        octree = await self._octomap.read(scene.world.octomap, is_diff=scene.is_diff)
         draft = self._bodies.draft()
         if not scene.is_diff:
             draft.remove("")
@@ -154,26 +165,32 @@ class SceneServer:
             self._attach(draft, attached)
         if scene.allowed_collision_matrix.entry_names or scene.allowed_collision_matrix.default_entry_names:
             draft.allowed = self._allowed(scene.allowed_collision_matrix, draft)
-        self._apply(draft)
+        with as_moveit(MoveItErrorCodes.INVALID_OBJECT_NAME):
+            self._bodies.apply(draft)
+        self._octomap.put(octree, scene.world.octomap)
         self._colors.update({color.id: color for color in scene.object_colors})
+        await self._changed()
 
-    def _on_object(self, message: CollisionObject) -> None:
+    async def _on_object(self, message: CollisionObject) -> None:
         check_fields(message, OBJECT, "collision object")
         draft = self._bodies.draft()
         self._put(draft, message)
-        self._apply(draft)
+        await self._apply(draft)
 
-    def _on_attached(self, message: AttachedCollisionObject) -> None:
+    async def _on_attached(self, message: AttachedCollisionObject) -> None:
         check_fields(message, ATTACHED, "attached object")
         draft = self._bodies.draft()
         self._attach(draft, message)
-        self._apply(draft)
+        await self._apply(draft)
 
-    def _apply(self, draft: Draft) -> None:
+    async def _apply(self, draft: Draft) -> None:
         with as_moveit(MoveItErrorCodes.INVALID_OBJECT_NAME):
             self._bodies.apply(draft)
-        self._show()
+        await self._changed()
+
+    async def _changed(self) -> None:
         self._on_change()
+        await self._show()
 
     def _check_state(self, scene: PlanningScene) -> None:
         state = self._convert.state(scene.robot_state)
@@ -190,8 +207,9 @@ class SceneServer:
             if message.operation == CollisionObject.REMOVE:
                 draft.remove(message.id)
                 return
-            if not message.id:
-                raise OpenArmError(Code.INVALID_ARGUMENT, "an object without id, expected one")
+            if message.id in ("", _OCTOMAP):
+                text = f"an object with the id {message.id!r}, expected one of its own"
+                raise OpenArmError(Code.INVALID_ARGUMENT, text)
             T, shapes = self._convert.shapes(message)
             if message.operation == CollisionObject.MOVE:
                 if shapes:
@@ -243,7 +261,8 @@ class SceneServer:
 
     def _allowed(self, matrix: AllowedCollisionMatrix, draft: Draft) -> frozenset[frozenset[str]]:
         """Pairs of a matrix that may touch, but for those of the SRDF, which can't be taken back."""
-        names, rows = list(matrix.entry_names), [list(entry.enabled) for entry in matrix.entry_values]
+        names = [MAP if name == _OCTOMAP else name for name in matrix.entry_names]
+        rows = [list(entry.enabled) for entry in matrix.entry_values]
         if len(rows) != len(names) or any(len(row) != len(names) for row in rows):
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"allowed_collision_matrix has {len(names)} names and is not square like them"
@@ -262,15 +281,14 @@ class SceneServer:
                 text = f"{names[i]!r} and {names[j]!r} are left out by the SRDF and can't be checked again"
                 raise OpenArmError(Code.INVALID_ARGUMENT, f"allowed_collision_matrix: {text}")
         everyone = {*self._entry_names(), *draft.world, *names}
-        for name, enabled in zip(matrix.default_entry_names, matrix.default_entry_values, strict=True):
+        for given, enabled in zip(matrix.default_entry_names, matrix.default_entry_values, strict=True):
+            name = MAP if given == _OCTOMAP else given
             if enabled:
                 out |= {frozenset((name, other)) for other in everyone if other != name and other not in names}
         return frozenset(out - self._description.allowed_collisions)
 
     # --- what is published
-    def _show(self) -> None:
-        """Publish the scene when it has changed, or someone listens."""
-        version = self._service.scene.version
-        if version != self._shown or self._monitored.get_subscription_count():
-            self._shown = version
-            self._monitored.publish(self.message())
+    async def _show(self) -> None:
+        """Publish the scene while someone listens."""
+        if self._monitored.get_subscription_count():
+            self._monitored.publish(await self.message())
