@@ -226,7 +226,9 @@ class CollisionScene(LineChecks):
     def _from_map(self) -> dict[int, float]:
         keep, hand = self._around.clearance, self._robot.arm.hand
         out = {i: keep.hand if self._robot.links[i] in hand else keep.world for i in self._robot.moving}
-        return out | {self._boxes[self._held_name(box.id)]: keep.hand for box in self._around.held}
+        out |= {self._boxes[self._held_name(box.id)]: keep.hand for box in self._around.held}
+        # exact checks with the map know no negative distance: what may touch it is left out
+        return {i: d for i, d in out.items() if frozenset((body_of(self._names[i]), MAP)) not in self._around.allowed}
 
     def collides(self, q: ArrayLike) -> bool:
         """Whether some pair is nearer than it may be at the arm's configuration (n,)."""

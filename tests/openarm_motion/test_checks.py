@@ -84,6 +84,25 @@ def test_a_motion_into_the_other_arm_is_refused(arms: dict[str, Arm], home: dict
         check_against_others(right, motions["right"], there)
 
 
+@pytest.mark.requirement("A-68")
+def test_motions_that_begin_together_are_checked_at_the_same_moments(
+    arms: dict[str, Arm], home: dict[str, float]
+) -> None:
+    left, right = arms["left"], arms["right"]
+    pose = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.26, 0.0, 0.60))
+    plan = moves.to_pose(right, right.start_state(home), pose, RequestBoxes())
+    there = Motion(plan.names, plan.t, plan.q)
+    other = moves.to_pose(left, left.start_state(home), pose, RequestBoxes())
+    away = Motion(other.names, other.t, other.q[::-1])
+    inside = {**home, **dict(zip(left.names, away.q[0].tolist(), strict=True))}
+
+    with refuses(Code.IN_COLLISION, r"wait until the other arm"):
+        check_against_others(right, there.later(away.duration), inside)
+    check_against_others(right, there.later(away.duration), inside, [(left, away)])
+    with refuses(Code.IN_COLLISION, r"right arm after .*openarm_left_.*; plan the arms together"):
+        check_against_others(right, there, home, [(left, Motion(other.names, other.t, other.q))])
+
+
 def test_what_is_held_follows_the_plan(plan: Trajectory) -> None:
     memory = HeldObjects()
     box = Box("cube", np.eye(4), np.array([0.05, 0.05, 0.05]))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.solids import box_from
+from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.constraints.asked import CartesianGoal, RegionGoal
 from openarm_motion.constraints.cartesian import along
 from openarm_motion.constraints.goals import in_region
@@ -181,6 +181,30 @@ def test_a_state_is_judged_by_contacts_and_constraints(T: np.ndarray, arm, now) 
     assert not blocked.valid
     assert {contact.second for contact in blocked.contacts} == {"box"}
     assert blocked.constraints[0][1] == pytest.approx(0.4, abs=1e-6)
+
+
+def test_the_distance_from_a_constraint_counts_by_its_weight(T: np.ndarray, arm, now) -> None:
+    turned = OrientationRegion("tool", np.eye(3), T[:3, :3] @ se3.rot_x(0.5), (0.1, 0.1, 0.1), weight=2.5)
+    joint = JointInterval(arm.names[0], float(now.start[0]) + 0.3, 0.1, 0.1, weight=0.5)
+
+    verdict = judge(arm, now, NOTHING, Region((joint,), (), (turned,)))
+
+    assert [beyond for _, beyond in verdict.constraints] == pytest.approx([0.5 * 0.2, 2.5 * 0.4], abs=1e-6)
+
+
+def test_more_attempts_take_the_path_that_is_followed_soonest(arm, now) -> None:
+    """Of ways about a box; a straight line needs no second one."""
+    q = now.start + np.array([0.9, 0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
+    box = box_from("box", arm.kinematics.fk(0.5 * (now.start + q))[:3, 3], (0.1, 0.1, 0.1))
+    goal = RegionGoal((Region(tuple(JointInterval(n, x, 1e-3, 1e-3) for n, x in zip(arm.names, q, strict=True))),))
+
+    def seconds(seeds: range, *boxes: Box) -> float:
+        return to_region(arm, replace(now, seeds=seeds), goal, RequestBoxes(boxes)).duration
+
+    alone = [seconds(range(k, k + 1), box) for k in range(4)]
+    assert min(alone) < 0.9 * alone[0], "the seeds make a difference"
+    assert seconds(range(4), box) == min(alone)
+    assert seconds(range(2**31)) == seconds(range(1))
 
 
 def test_groups_and_links_are_those_of_the_description(arm, arms) -> None:

@@ -22,7 +22,6 @@ from openarm_common.octree.codec import TREE_ID, decode
 from openarm_common.printable import brief
 from openarm_common.ros.convert import matrix_to_pose
 from openarm_common.ros.node import BaseNode
-from openarm_common.types import Array
 from openarm_motion.ros.move_group.convert import Converter
 from openarm_motion.scene.octree import SceneOctree
 from openarm_motion.service.motion_service import MotionService
@@ -32,8 +31,6 @@ from openarm_motion.service.robot import Watch
 _ANSWER = 1.0
 #: Maps that were given are known again, so many of them.
 _GIVEN = 64
-#: An octomap further away is a mistake, m.
-_FARTHEST = 1000.0
 
 
 class SceneOctomap:
@@ -81,7 +78,7 @@ class SceneOctomap:
         if not octomap.data:
             return self._service.scene.octree if is_diff and not octomap.id else None
         T = self._convert.pose(message.origin, frame)
-        self._check(message, T)
+        self._check(message)
         if np.allclose(T, np.eye(4), atol=1e-9) and _digest(message) in self._given:
             return None
         data = np.frombuffer(octomap.data, np.uint8)
@@ -96,7 +93,7 @@ class SceneOctomap:
             self._taken.octomap = message.octomap
         self._service.scene.see(octree)
 
-    def _check(self, message: OctomapWithPose, T: Array) -> None:
+    def _check(self, message: OctomapWithPose) -> None:
         octomap, frame = message.octomap, message.header.frame_id
         if not octomap.id:
             text = f"octomap.id is empty and there are data, expected the class of the tree, such as {TREE_ID!r}"
@@ -106,9 +103,6 @@ class SceneOctomap:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"world.octomap.{text}; expected the same twice, or the former empty"
             )
-        if np.linalg.norm(T[:3, 3]) > _FARTHEST:
-            text = f"world.octomap is at {T[:3, 3].tolist()} m, expected within {_FARTHEST:g} m of the robot"
-            raise OpenArmError(Code.INVALID_ARGUMENT, text)
 
 
 def _digest(message: OctomapWithPose) -> bytes:

@@ -117,6 +117,9 @@ class Requests:
         if not np.isfinite(numbers).all() or min(numbers) < 0.0:
             text = "max_step, revolute_jump_threshold, jump_threshold"
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{text} are {numbers}, expected numbers >= 0")
+        if message.prismatic_jump_threshold != 0.0 and self._service.arms[arm].kinematics.prismatic.any():
+            text = f"prismatic_jump_threshold is {message.prismatic_jump_threshold:g}: not for joints that slide"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}, expected 0; jump_threshold is for all joints")
         T_link_tool = se3.inverse(self._convert.on_tool(arm, message.link_name))
         frame = message.header.frame_id
         goal = CartesianGoal(

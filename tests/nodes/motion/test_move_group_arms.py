@@ -3,12 +3,20 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+from control_msgs.action import ParallelGripperCommand
 from moveit_msgs.action import ExecuteTrajectory, MoveGroup
 from moveit_msgs.msg import Constraints, MotionPlanRequest, OrientationConstraint
 from moveit_msgs.msg import MoveItErrorCodes as Codes
 from moveit_msgs.srv import GetCartesianPath, GetPositionIK, GetStateValidity
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.task import Future
 from trajectory_msgs.msg import JointTrajectoryPoint
 
 from openarm_common import se3
@@ -201,3 +209,129 @@ def test_a_goal_that_is_refused_or_of_another_arm_or_that_only_plans_ends_no_oth
     assert code(first, arms) == Codes.SUCCESS
     assert code(other, arms) == Codes.SUCCESS
     assert arms.where() == pytest.approx(arms.posture(), abs=2e-3)
+
+
+class Gripper:
+    """A hand that moves until it is cancelled, but for goals that it reaches at once."""
+
+    def __init__(self, arms: Arms, reached: float) -> None:
+        self.asked: list[float] = []
+        self._reached, self._wake = reached, arms.ros.node.create_timer(0.01, self._tick)
+        self._waiting: list[Future] = []
+        name = f"/{SIDE}_gripper_controller/gripper_cmd"
+        accept = lambda _: CancelResponse.ACCEPT  # noqa: E731
+        ActionServer(arms.ros.node, ParallelGripperCommand, name, self._execute, cancel_callback=accept)
+
+    def _tick(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        for future in waiting:
+            future.set_result(None)
+
+    async def _execute(self, handle) -> ParallelGripperCommand.Result:
+        position = handle.request.command.position[0]
+        self.asked.append(position)
+        while position != self._reached and not handle.is_cancel_requested:
+            self._waiting.append(Future())
+            await self._waiting[-1]
+        handle.canceled() if handle.is_cancel_requested else handle.succeed()
+        return ParallelGripperCommand.Result(reached_goal=position == self._reached)
+
+
+def test_a_hand_stops_for_a_cancelled_and_for_a_newer_goal_and_has_no_path_constraints(arms: Arms) -> None:
+    finger = arms.bench.description.finger_joint(SIDE)
+    limits = arms.bench.description.joint(finger)
+    low, high = limits.lower, limits.upper
+    gripper = Gripper(arms, high)
+    arms.ros.spin_until(arms.group._hands._clients[SIDE].server_is_ready, what="the gripper")
+    hand = lambda x: MoveGroup.Goal(request=arms.joint_goal([x], [finger], f"{SIDE}_gripper"))  # noqa: E731
+
+    handle, future = arms.bench.start(arms.move, hand(low))
+    arms.ros.spin_until(lambda: gripper.asked == [low], what="the hand to move")
+    handle.cancel_goal_async()
+    assert code(future, arms) == Codes.PREEMPTED
+    _, future = arms.bench.start(arms.move, hand(0.5 * (low + high)))
+    arms.ros.spin_until(lambda: len(gripper.asked) == 2, what="the hand to move")
+    assert arms.bench.run(arms.move, hand(high)).error_code.val == Codes.SUCCESS
+    assert code(future, arms) == Codes.PREEMPTED
+    goal = hand(low)
+    goal.request.path_constraints = goal.request.goal_constraints[0]
+    said = arms.bench.run(arms.move, goal).error_code.message
+    assert said == "path_constraints: group 'right_gripper' goes straight to its goal, expected none"
+    goal = hand(low)
+    goal.request.pipeline_id = "chomp"
+    assert "pipeline_id is 'chomp'" in arms.bench.run(arms.move, goal).error_code.message
+    assert gripper.asked == [low, 0.5 * (low + high), high]
+
+
+def test_what_a_request_says_in_vain_is_said_or_refused_by_name(arms: Arms) -> None:
+    request = arms.joint_goal(arms.named())
+    request.goal_constraints[0].joint_constraints[2].weight = 0.25
+    assert "every constraint is met, whatever its weight (0.25, 1)" in arms.plan(request).error_code.message
+    request.goal_constraints[0].joint_constraints[2].weight = -1.0
+    assert "joint3: weight is -1, expected a number >= 0" in arms.plan(request).error_code.message
+    for field in ("max_velocity_scaling_factor", "max_acceleration_scaling_factor"):
+        request = arms.joint_goal(arms.named())
+        setattr(request, field, 1.5)
+        assert f"{field} is 1.5, expected 0.001 to 1" in arms.plan(request).error_code.message
+    request = arms.joint_goal(arms.named())
+    request.start_state.joint_state.name = [arms.arm.names[0]]
+    request.start_state.joint_state.position = [0.3]
+    assert "start_state" not in arms.plan(request).error_code.message
+    moved = arms.bench.run(arms.move, MoveGroup.Goal(request=request))
+    assert moved.error_code.val == Codes.SUCCESS, moved.error_code.message
+    assert "it started where the arm was, not in start_state" in moved.error_code.message
+
+
+#: Both arms go to a posture; then one goes home, and is sent back on its way.
+_PROGRAM = """
+import json, sys, threading, time
+import rclpy
+from moveit_msgs.action import MoveGroup
+from moveit_msgs.msg import MoveItErrorCodes
+from pymoveit2 import MoveIt2
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+asked = json.loads(sys.argv[1])
+rclpy.init()
+node = Node("program")
+names = asked["base"], asked["tool"]
+make = lambda group: MoveIt2(node, asked[group]["joints"], *names, group, use_move_group_action=True)
+both, one = make("both_arms"), make("right_arm")
+executor = SingleThreadedExecutor()
+executor.add_node(node)
+threading.Thread(target=executor.spin, daemon=True).start()
+ActionClient(node, MoveGroup, "move_action").wait_for_server()
+both.wait_for_joint_state(30.0)
+both.max_velocity = both.max_acceleration = one.max_velocity = one.max_acceleration = 1.0
+one.num_planning_attempts = 3
+both.move_to_configuration(asked["both_arms"]["goal"])
+print(both.wait_until_executed(), flush=True)
+one.max_velocity = one.max_acceleration = 0.1
+one.move_to_configuration(asked["right_arm"]["goal"])
+time.sleep(0.5)
+both.move_to_configuration(asked["both_arms"]["goal"])
+print(both.wait_until_executed(), flush=True)
+print(one.wait_until_executed(), flush=True)
+print(one.get_last_execution_error_code().val == MoveItErrorCodes.PREEMPTED, flush=True)
+"""
+
+
+def test_a_program_on_pymoveit2_moves_both_arms_and_takes_over_from_its_own_goal(arms: Arms) -> None:
+    pytest.importorskip("pymoveit2", reason="needs the extra moveit")
+    arms.bench.robot.speed = 1.0
+    asked = {
+        "base": arms.bench.description.base,
+        "tool": arms.tool,
+        BOTH: {"joints": arms.names, "goal": arms.posture().tolist()},
+        GROUP: {"joints": list(arms.arm.names), "goal": arms.where()[7:].tolist()},
+    }
+    env = {**os.environ, "ROS_DOMAIN_ID": str(arms.node.context.get_domain_id())}
+    with subprocess.Popen(
+        [sys.executable, "-c", _PROGRAM, json.dumps(asked)], env=env, stdout=subprocess.PIPE, text=True
+    ) as program:
+        arms.ros.spin_until(lambda: program.poll() is not None, what="the program")
+        said = program.stdout.read().split()
+    assert said == ["True", "True", "False", "True"]
+    assert arms.where() == pytest.approx(arms.posture(), abs=5e-3)
