@@ -98,6 +98,21 @@ class ArmCoordination:
             raise
         return delay
 
+    async def check_together(self, arms: Sequence[Arm], given: Sequence[Motion]) -> None:
+        """Refuse trajectories that begin at the same moment and on which the arms would meet.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, LIMITS or IN_COLLISION.
+        """
+        state = self._robot.states.latest()[1]
+        pairs = [(arm, check_trajectory(arm, motion, state)) for arm, motion in zip(arms, given, strict=True)]
+
+        def check() -> None:
+            for arm, motion in pairs:
+                check_against_others(arm, motion, state, [pair for pair in pairs if pair[0] is not arm])
+
+        await self._robot.compute(check, _NOMINAL)
+
     async def follow_together(
         self,
         arms: Sequence[Arm],
@@ -108,16 +123,12 @@ class ArmCoordination:
         """Execute trajectories of several arms that begin at the same moment; when one fails the others hold.
 
         Raises:
-            OpenArmError: the first fault; INVALID_ARGUMENT, LIMITS or IN_COLLISION, for trajectories that the arms
-                should not follow; as `TrajectoryFollower.follow`.
+            OpenArmError: the first fault; as `TrajectoryFollower.follow`.
         """
         stamp_ns, state = self._robot.states.latest()
         # both controllers begin at the same moment, so that none begins earlier than the other
         begin_ns = stamp_ns + round(_HEAD_STARTS[0] * 1e9)
         motions = [check_trajectory(arm, motion, state) for arm, motion in zip(arms, given, strict=True)]
-        pairs = list(zip(arms, motions, strict=True))
-        for arm, motion in pairs:
-            check_against_others(arm, motion, state, [pair for pair in pairs if pair[0] is not arm])
         faults: list[OpenArmError] = []
         shares = [0.0] * len(motions)
 

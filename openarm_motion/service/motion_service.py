@@ -296,12 +296,12 @@ class MotionService:
         if len(motions) == 1:
             return await self.execute(ExecuteRequest(*next(iter(motions.items()))), cancelled, report)
         try:
-            arms = self._two_arms(list(motions))
+            arms, parts = self._two_arms(list(motions)), list(motions.values())
+            progress = lambda share: report("executing", share)  # noqa: E731
             with self.claims.holding(*motions, wanted=True):
                 await self._context.fresh()
-                await self.coordination.follow_together(
-                    arms, list(motions.values()), self._stopped(cancelled), lambda share: report("executing", share)
-                )
+                await self.coordination.check_together(arms, parts)
+                await self.coordination.follow_together(arms, parts, self._stopped(cancelled), progress)
         except OpenArmError as error:
             return MotionAnswer(error, error.message)
         return MotionAnswer(message="arrived")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from octomap_msgs.msg import OctomapWithPose
@@ -24,8 +24,10 @@ from openarm_common.ros.convert import matrix_to_pose
 from openarm_common.ros.node import BaseNode
 from openarm_motion.ros.move_group.convert import Converter
 from openarm_motion.scene.octree import SceneOctree
-from openarm_motion.service.motion_service import MotionService
 from openarm_motion.service.robot import Watch
+
+if TYPE_CHECKING:
+    from openarm_motion.service.motion_service import MotionService
 
 #: The map has this long to answer, s.
 _ANSWER = 1.0
