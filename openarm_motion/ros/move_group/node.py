@@ -106,7 +106,10 @@ class MoveGroupNode(BaseNode[NoParameters]):
         self._refused = ("", "")
         self._stops, self._turns = 0, Turns(service.robot)
         octomap = SceneOctomap(self, service, self._convert, config.map)
-        self.scene = SceneServer(self, service, robot, names, self._convert, self._requests, octomap, self.on_scene)
+        show = lambda: self.on_scene()  # noqa: E731  # set later
+        self.scene = SceneServer(
+            self, service, robot, names, self._convert, self._requests, octomap, show, self._refuse
+        )
         self._display = self.create_publisher(DisplayTrajectory, "/display_planned_path", QOS_LATCHED)
         semantic = self.create_publisher(String, "/robot_description_semantic", QOS_LATCHED)
         semantic.publish(String(data=robot.srdf))
@@ -336,7 +339,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
                 ]
         except OpenArmError as error:
             response.valid = False
-            self._refuse("/check_state_validity", error, MotionPlanResponse())
+            self._refuse("/check_state_validity", error)
         return response
 
     def _contact(self, contact: Contact) -> ContactInformation:
@@ -367,7 +370,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
             await self._map.call_async(Empty.Request())
         else:
             error = OpenArmError(Code.NOT_READY, f"no service {self._map.srv_name}; is the octomap node running?")
-            self._refuse("/clear_octomap", error, MotionPlanResponse())
+            self._refuse("/clear_octomap", error)
         return response
 
     async def _answer(self, name: str, coded: Any, response: ResponseT, work: Awaitable[None]) -> ResponseT:
@@ -378,10 +381,12 @@ class MoveGroupNode(BaseNode[NoParameters]):
             self._refuse(name, error, coded)
         return response
 
-    def _refuse(self, name: str, error: OpenArmError, coded: Any) -> None:
-        coded.error_code = error_code(error)
+    def _refuse(self, name: str, error: OpenArmError, coded: Any = None) -> None:
+        code = error_code(error)
+        if coded is not None:
+            coded.error_code = code
         self._refused = (name, error.message)
-        self.get_logger().error(f"{name}: {error} (MoveIt's error code {coded.error_code.val})")
+        self.get_logger().error(f"{name}: {error} (MoveIt's error code {code.val})")
         self._report()
 
     def _report(self) -> None:

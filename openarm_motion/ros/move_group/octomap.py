@@ -22,11 +22,11 @@ from openarm_common.octree.codec import TREE_ID, decode
 from openarm_common.printable import brief
 from openarm_common.ros.convert import matrix_to_pose
 from openarm_common.ros.node import BaseNode
-from openarm_motion.ros.move_group.convert import Converter
 from openarm_motion.scene.octree import SceneOctree
 from openarm_motion.service.robot import Watch
 
 if TYPE_CHECKING:
+    from openarm_motion.ros.move_group.convert import Converter
     from openarm_motion.service.motion_service import MotionService
 
 #: The map has this long to answer, s.

@@ -55,6 +55,7 @@ class SceneServer:
         requests: Checks what hands may touch.
         octomap: Of the scene.
         on_change: Called when the scene has changed.
+        refuse: Reports a refusal of what has a name.
     """
 
     def __init__(
@@ -67,9 +68,11 @@ class SceneServer:
         requests: Requests,
         octomap: SceneOctomap,
         on_change: Callable[[], None],
+        refuse: Callable[[str, OpenArmError], None],
     ) -> None:
         self._node, self._service, self._description, self._names = node, service, description, names
-        self._convert, self._requests, self._octomap, self._on_change = convert, requests, octomap, on_change
+        self._convert, self._requests, self._octomap = convert, requests, octomap
+        self._on_change, self._refuse = on_change, refuse
         self._bodies = SceneBodies(service)
         self._colors: dict[str, ObjectColor] = {}
         self._monitored = node.create_publisher(PlanningScene, "/monitored_planning_scene", QOS_COMMAND)
@@ -140,8 +143,7 @@ class SceneServer:
             await self._change(request.scene)
             response.success = True
         except OpenArmError as error:
-            self._node.get_logger().error(f"/apply_planning_scene refused: {error}")
-            self._node.diagnose_warning(f"/apply_planning_scene refused: {error.message}")
+            self._refuse("/apply_planning_scene", error)
         return response
 
     async def clear_octomap(self) -> None:

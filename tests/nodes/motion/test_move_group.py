@@ -25,6 +25,7 @@ from moveit_msgs.srv import (
 )
 from rclpy.action.client import ClientGoalHandle
 from std_msgs.msg import String
+from visualization_msgs.msg import MarkerArray
 
 from openarm_common import se3
 from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix
@@ -186,9 +187,11 @@ def test_a_state_is_judged_with_its_contacts(client: Client) -> None:
 def test_bodies_are_put_moved_attached_and_detached(client: Client) -> None:
     T = client.arm.kinematics.fk(client.q())
     there = se3.make(None, (0.4, 0.5, 0.9))
+    shown = client.ros.hear(MarkerArray, "/motion/scene", QOS_LATCHED)
     scene = PlanningScene()
     scene.world.collision_objects = [client.box(there, edge=0.05)]
     assert client.apply(copy.deepcopy(scene))
+    client.ros.spin_until(lambda: shown and "box" in {m.ns for m in shown[-1].markers}, what="the box on /motion/scene")
     assert [body.id for body in client.scene().world.collision_objects] == ["box"]
 
     moved = CollisionObject(id="box", pose=matrix_to_pose(T), operation=CollisionObject.MOVE)

@@ -142,10 +142,9 @@ def test_an_octomap_that_is_none_is_refused_and_changes_nothing(scenes: Scenes, 
         setattr(wrong.octomap, name, value)
 
     assert not scenes.see(wrong)
-
+    values = lambda: [v.value for m in reports for s in m.status for v in s.values if v.key == "last_refusal"]  # noqa: E731
+    scenes.ros.spin_until(lambda: any(said in value for value in values()), what=said)
     assert scenes.blocked(), "the one before it"
-    heard = lambda: any(said in s.message for m in reports for s in m.status)  # noqa: E731
-    scenes.ros.spin_until(heard, what=said)
 
 
 def test_the_map_is_given_and_left_to_the_map_when_a_client_sends_it_back(scenes: Scenes, tmp_path: Path) -> None:
