@@ -105,9 +105,13 @@ class MotionNode(BaseNode[MotionConfig]):
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
         if config.move_group.enabled:
             group = _adapter(_MOVE_GROUP).MoveGroupNode(
-                self.service, config.move_group, config.controller, self._holds.check, context=self.context
+                self.service,
+                config.move_group,
+                config.controller,
+                self._holds.check,
+                self._show_scene,
+                context=self.context,
             )
-            group.on_scene = self._show_scene
             self.companions = (group,)
         if config.servo.enabled:
             servo = _adapter(_SERVO).ServoNode(

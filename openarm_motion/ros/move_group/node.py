@@ -82,6 +82,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
         config: Parameters.
         controller: Name of the trajectory action of an arm.
         check_hold: Refuses a goal, by arm and id, that would move an arm that another client holds.
+        on_scene: Called when a client of MoveIt has changed the scene.
     """
 
     def __init__(
@@ -90,6 +91,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
         config: MoveGroupConfig,
         controller: str,
         check_hold: Callable[[str, bytes], None],
+        on_scene: Callable[[], None],
         **kwargs: Any,
     ) -> None:
         # a remapping of the process's node name is for the motion node
@@ -106,9 +108,8 @@ class MoveGroupNode(BaseNode[NoParameters]):
         self._refused = ("", "")
         self._stops, self._turns = 0, Turns(service.robot)
         octomap = SceneOctomap(self, service, self._convert, config.map)
-        show = lambda: self.on_scene()  # noqa: E731  # set later
         self.scene = SceneServer(
-            self, service, robot, names, self._convert, self._requests, octomap, show, self._refuse
+            self, service, robot, names, self._convert, self._requests, octomap, on_scene, self._refuse
         )
         self._display = self.create_publisher(DisplayTrajectory, "/display_planned_path", QOS_LATCHED)
         semantic = self.create_publisher(String, "/robot_description_semantic", QOS_LATCHED)
@@ -127,9 +128,6 @@ class MoveGroupNode(BaseNode[NoParameters]):
         self.create_service(Empty, "/clear_octomap", self._on_clear)
         self.create_subscription(String, "/trajectory_execution_event", self._on_event, QOS_COMMAND)
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
-
-    #: Called when a client of MoveIt has changed the scene.
-    on_scene: Callable[[], None] = staticmethod(lambda: None)
 
     def close(self) -> None:
         """Take servers and clients down, then as every node."""
