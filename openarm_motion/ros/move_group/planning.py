@@ -156,7 +156,7 @@ class Requests:
             text = f"controller_names has {unknown[0]!r}; the joints are those of {', '.join(map(repr, there))}"
             raise MoveItError(MoveItErrorCodes.CONTROL_FAILED, text)
         whole = Motion(tuple(names), t, q, v, a)
-        return {arm: whole if len(arms) == 1 else whole.of(self._service.arms[arm].names) for arm in arms}
+        return {arm: whole.of(self._service.arms[arm].names) for arm in arms}
 
     def arms(self, group: str) -> tuple[str, ...]:
         """The arm, or the two arms, of a planning group.
