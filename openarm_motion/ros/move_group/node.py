@@ -59,8 +59,8 @@ from openarm_motion.ros.move_group.fields import EXECUTE, FK, IK, MOVE, VALIDITY
 from openarm_motion.ros.move_group.hands import Hands
 from openarm_motion.ros.move_group.octomap import SceneOctomap
 from openarm_motion.ros.move_group.planning import PIPELINE, Requests
+from openarm_motion.ros.move_group.preemption import Preemption
 from openarm_motion.ros.move_group.scene import SceneServer
-from openarm_motion.ros.move_group.turns import Turns
 from openarm_motion.service.requests import MoveRequest
 from openarm_motion.timing.trajectory import Motion
 
@@ -106,7 +106,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
         self._requests = Requests(service, names, self._convert)
         self._hands = Hands(self, config, service, robot, names)
         self._refused = ("", "")
-        self._stops, self._turns = 0, Turns(service.robot)
+        self._stops, self._preemption = 0, Preemption(service.robot)
         octomap = SceneOctomap(self, service, self._convert, config.map)
         self.scene = SceneServer(
             self, service, robot, names, self._convert, self._requests, octomap, on_scene, self._refuse
@@ -162,11 +162,11 @@ class MoveGroupNode(BaseNode[NoParameters]):
             if hand := self._hands.of_joints(names):
                 check_fields(handle.request, EXECUTE, "trajectory")
                 names, t, q, _, _ = trajectory_from_msg(handle.request.trajectory.joint_trajectory)
-                async with self._turn(handle, {hand: names}) as stopped:
+                async with self._alone(handle, {hand: names}) as stopped:
                     await self._hands.execute(hand, Motion(tuple(names), t, q), stopped)
             else:
                 motions = self._requests.execute(handle.request, lambda arm: self._controller.format(arm=arm))
-                async with self._turn(handle, {arm: motion.names for arm, motion in motions.items()}) as stopped:
+                async with self._alone(handle, {arm: motion.names for arm, motion in motions.items()}) as stopped:
                     (await self._service.execute_arms(motions, stopped)).require()
             result.error_code = error_code(None, "arrived")
         except OpenArmError as error:
@@ -174,17 +174,17 @@ class MoveGroupNode(BaseNode[NoParameters]):
         self._end(handle, result.error_code.val == result.error_code.SUCCESS)
         return result
 
-    def _turn(
+    def _alone(
         self, handle: ServerGoalHandle | None, moved: Mapping[str, Sequence[str]]
     ) -> AbstractAsyncContextManager[Callable[[], bool]]:
-        """The turn of a goal, or of a service, that moves joints of some arms."""
+        """Let a goal, or a service, move joints of some arms alone."""
         stops = self._stops
         if handle is not None:
             for arm in moved:
                 self._check_hold(arm, bytes(handle.goal_id.uuid))
         joints = [name for names in moved.values() for name in names]
         ended = lambda: handle is not None and (bool(handle.is_cancel_requested) or self._stops != stops)  # noqa: E731
-        return self._turns.take(joints, ended)
+        return self._preemption.take(joints, ended)
 
     def _end(self, handle: ServerGoalHandle, success: bool) -> None:
         if success:
@@ -223,7 +223,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
         hand, note = self._hands.groups.get(request.group_name, ""), self._requests.note(request, execute=execute)
         asked = None if hand else self._requests.plan(request, execute=execute)
         moved = {arm: self._service.arms[arm].names for arm in asked.arms} if asked else self._hands.joints(hand)
-        async with self._turn(handle, moved if execute else {}) as stopped:
+        async with self._alone(handle, moved if execute else {}) as stopped:
             answer.trajectory_start = self._state(RobotState() if execute else request.start_state)
             if asked is None:
                 motion: Motion = self._hands.plan(request)

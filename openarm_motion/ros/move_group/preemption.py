@@ -13,8 +13,8 @@ from openarm_motion.service.robot import RobotInterface, Watch
 _STILL, _OVER_NS, _LONGEST = 2e-3, 100_000_000, 3.0
 
 
-class Turns:
-    """Whose turn it is.
+class Preemption:
+    """Lets the newest goal of each joint move it.
 
     Args:
         robot: Knows whether joints move.
