@@ -11,12 +11,18 @@ the meshes does within a minute (`--long`). Times are processor time of the plan
 checked on the triangles, in states so near to each other that no joint turns by more than 0.01 rad between them, by
 code that shares nothing with the collision layers: a state that touches is a hit. `accepted` is the share of random
 states, 2 to 12 mm from a contact on the triangles, that the fast layer calls free.
+
+`panda_turns` are plans to joint positions with a joint 7 that turns without end, start and goal anywhere in two turns,
+past two posts. The peer is the same arm with limits far away, to the same postures in the nearest turns, which are
+found here: what obstacles ask of joint 7 is the same for both.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,8 +36,11 @@ from benchmarks.motion_problems import timed
 from benchmarks.report import Row, write_report
 from benchmarks.robot_models import ROBOTS, TrueMeshes, load_arm, states_of
 from benchmarks.robot_problems import FAMILIES, RobotProblem, problems
+from openarm_common.errors import OpenArmError
 from openarm_common.types import Array
+from openarm_motion.collision.solids import box_from
 from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.moves import RequestBoxes, to_joints
 from openarm_motion.planning.ompl_planner import OmplPlanner
 from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.rrt import FastPlanner
@@ -45,6 +54,8 @@ _NEAR, _STATES, _SCENES = (0.002, 0.012), 400, 5
 #: Targets over all families, ms.
 _MEDIAN, _P95 = 2.0, 20.0
 _PEER = "OMPL RRTConnect, coal on the same hulls"
+#: Plans of a joint that turns without end, their peer, and where the limits of the peer are, rad.
+_TURNS, _UNWOUND, _FAR = 200, "limits far away, nearest turns by hand", 30.0
 
 
 @dataclass
@@ -143,6 +154,39 @@ def _on_triangles(query: PlanQuery, hits: Callable[[Array], bool], seconds: floa
     return replace(query, fast=None, goals=goals, collides=hits, edge_free=edge_free, time_limit=seconds)
 
 
+def turn_rows(count: int) -> list[Row]:
+    """Plan with a Panda that turns joint 7 without end."""
+    arm, peer = load_arm("panda", endless="panda_joint7"), load_arm("panda", endless="panda_joint7")
+    peer.lower = peer.kinematics.lower = np.append(arm.lower[:-1], -_FAR)
+    peer.upper = peer.kinematics.upper = np.append(arm.upper[:-1], _FAR)
+    posts = [box_from(f"post{side}", (0.45, side * 0.35, 0.9), (0.08, 0.08, 0.9)) for side in (-1, 1)]
+    scene, rng = arm.scene({}, posts), np.random.default_rng(_REPORTED)
+    low, high = (np.append(ends[:-1], turn) for ends, turn in zip(arm.kinematics.span, (-6.0, 6.0), strict=True))
+    refused, beyond, seconds = np.zeros(2, np.int64), np.zeros((count, 2)), np.full((count, 2), np.nan)
+    for k in range(count):
+        start, goal = rng.uniform(low, high, (2, 7))
+        while scene.collides(start) or scene.collides(goal):
+            start, goal = rng.uniform(low, high, (2, 7))
+        short = np.append(goal[:-1], start[-1] + math.remainder(goal[-1] - start[-1], math.tau))
+        for i, (one, there) in enumerate(((arm, goal), (peer, short))):
+            begin = time.thread_time()
+            try:
+                q = to_joints(one, StartState({}, start), there, RequestBoxes(posts)).q
+            except OpenArmError:
+                refused[i] += 1
+                continue
+            seconds[k, i] = time.thread_time() - begin
+            beyond[k, i] = np.abs(np.diff(q[:, -1])).sum() - abs(short[-1] - start[-1])
+    median, mean = np.nanmedian(seconds, axis=0) * 1e3, beyond.mean(axis=0)
+    print(f"panda  turns of joint 7: {count - refused[0]} of {count} planned ({count - refused[1]} by the peer),")
+    print(f"       {mean[0]:.3f} rad beyond the short way ({mean[1]:.3f}), {median[0]:.2f} ms ({median[1]:.2f})")
+    return [
+        Row("panda_turns_refused", float(refused[0]), "", "lower", 0.0, _UNWOUND, float(refused[1]), count),
+        Row("panda_turns_beyond_rad", float(mean[0]), "rad", "lower", None, _UNWOUND, float(mean[1]), count),
+        Row("panda_turns_median_ms", float(median[0]), "ms", "lower", None, _UNWOUND, float(median[1]), count),
+    ]
+
+
 def _percentiles(seconds: Sequence[float]) -> tuple[float, float]:
     """Median and p95, ms."""
     median, p95 = np.percentile(seconds, (50, 95))
@@ -191,6 +235,8 @@ def main() -> None:
         tallies.append(_together(robot, tallies))
         print(tallies[-1].line(), flush=True)
         rows += [row for tally in tallies for row in tally.rows()]
+    if "panda_turns".startswith(args.only):
+        rows += turn_rows(_TURNS // 10 if args.quick else _TURNS)
     write_report(rows, args.json)
 
 

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -46,15 +47,19 @@ ROBOTS: Mapping[str, RobotModel] = {
 }
 
 
-def load_arm(name: str, *, touching: bool = False) -> Arm:
+def load_arm(name: str, *, touching: bool = False, endless: str = "") -> Arm:
     """A robot of `ROBOTS` as an arm.
 
     Args:
         name: Of the robot.
         touching: Whether paths keep no distance, as in the problems of the literature; lines are checked more finely
             then. False leaves the defaults.
+        endless: Joint that turns without end.
     """
     description = RobotDescription.load(name)
+    if endless:
+        joint = replace(description.joint(endless), type="continuous", lower=-math.inf, upper=math.inf)
+        description = description._with_joints(joint)  # pyright: ignore[reportPrivateUsage]
     config = MotionConfig()
     if touching:
         planning = config.planning.model_copy(update={"edge_step": _STEP, "edge_travel": _TRAVEL})

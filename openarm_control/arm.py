@@ -16,6 +16,7 @@ from pydantic import Field
 
 from openarm_common.config import Config
 from openarm_common.errors import Code
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_control.carrier import Carrier, CarrierConfig
 from openarm_control.follower import End, Follower, Tracker
@@ -288,6 +289,7 @@ class TrajectoryFollower(Follower):
         t, q = t[ahead], q[ahead]
         v, a = (None if x is None else x[ahead] for x in (v, a))
         command, speed = self._command.position, self._command.velocity
+        q = q + (nearest_turns(q[0], command, self.group.upper) - q[0])  # the command goes on from where it is
         offset = np.zeros_like(command)
         if t[0] > elapsed:  # the motion to the first point is part of the curve
             self._check_first_point(q[0], t[0] - elapsed)

@@ -133,6 +133,8 @@ class RobotController(JointController):
             (follower, at[follower.group]) for follower in (*self.arms.values(), *self.grippers.values())
         ]
         self._limits = limits_of(*arms.values(), *grippers.values())
+        #: Upper limits of the joints (n,), infinite for those that turn without end.
+        self.upper: Array = np.array([self._limits.get(name, (0.0, 0.0))[1] for name in joint_names])
 
     def check_command(self, names: Sequence[str], positions: Sequence[float]) -> PositionCommand:
         """Check a position command; names may be a part of the joints, in any order. May run in any thread.

@@ -9,6 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import ArrayLike
 
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_control.trajectory import JointGroup
 
@@ -129,9 +130,13 @@ class Follower(ABC):
         self._hold(position)
 
     def set_target(self, target: Array) -> None:
-        """Go to a position (k,), NaN for joints that stay as they are; ignored while a goal is followed."""
+        """Go to a position (k,), NaN for joints that stay as they are; ignored while a goal is followed.
+
+        Joints that turn without end go the short way.
+        """
         if not self.busy:
-            self._target = self._within_limits(np.where(np.isnan(target), self._target, target))
+            near = nearest_turns(target, self._command.position, self.group.upper)
+            self._target = self._within_limits(np.where(np.isnan(target), self._target, near))
 
     def halt(self) -> None:
         """Come to rest and hold, because commands ceased; a goal continues."""

@@ -83,7 +83,7 @@ def carriers(
         if not one.soft:
             found[side] = Carrier(one, config)
             continue
-        limits = description.limits(description.arm_joints(side))
+        limits = description.limits(description.arm_joints(side), np.pi)
         inertia = loads[side].inertia(*limits, _HELD_MASS) + one.armature
         gains = safe_gains(one.stiffness, one.damping, inertia, one.latency_s + _DELAY_S)
         found[side] = Carrier(one, config, loads[side], gains)

@@ -15,6 +15,7 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.pacing import Pacer, PeriodMeter
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_control.controller import RobotController
 from openarm_control.joints import JointReadout
@@ -154,8 +155,14 @@ class StreamedRobot(ControlLoop):
         return self._state.position + age_s * self._state.velocity
 
     def _note(self, fresh: JointReadout) -> None:
-        """Take a joint state; give up when it says that the robot was put elsewhere."""
-        before, self._state = self._state, self._with_finger_velocity(fresh)
+        """Take a joint state; give up when it says that the robot was put elsewhere.
+
+        Joints that turn without end go on from the last state, whatever turn an encoder starts again with.
+        """
+        before = self._state
+        if before is not None:
+            fresh = replace(fresh, position=nearest_turns(fresh.position, before.position, self._robot.upper))
+        self._state = self._with_finger_velocity(fresh)
         if before is not None and not self.fault:
             moved = np.abs(fresh.position - before.position)
             excess = moved - self._jump - self._speed * max(0.0, (fresh.t_ns - before.t_ns) * 1e-9)
@@ -174,7 +181,7 @@ class StreamedRobot(ControlLoop):
         if self._waits_since is None:
             self._waits_since = (state.t_ns, wall_ns)
         since_ns, began_ns = self._waits_since
-        targets = self._driver.targets(since_ns)
+        targets = nearest_turns(self._driver.targets(since_ns), state.position, self._robot.upper)
         if np.isnan(targets).any() and wall_ns - began_ns < _TARGETS_NS:
             return False
         self._waits_since, self.fault = None, ""

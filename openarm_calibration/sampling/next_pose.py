@@ -250,7 +250,7 @@ class PoseSearch:
         Until one is found they are drawn from the whole range, then around those that are known.
         """
         config, rng = self._config, self._rng
-        lower, upper = self._description.limits(samples.joint_names)
+        lower, upper = self._description.limits(samples.joint_names, np.pi)
         low, high = lower + config.joint_margin, upper - config.joint_margin
         lift = self._description.lift
         if lift is not None and lift.joint in samples.joint_names:  # it stays where it is

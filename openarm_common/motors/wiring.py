@@ -6,6 +6,7 @@ Values by joint are those of one arm, from the shoulder; all arms have the same 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Self
 
@@ -149,6 +150,10 @@ def axes_of(wiring: Wiring, description: RobotDescription, buses: Mapping[str, s
             raise OpenArmError(Code.CONFIG_INVALID, f"{text} one for each joint, and the gripper's")
         bus = (buses or {}).get(first.setdefault(place.bus, arm), place.bus)
         lower, upper = description.limits(parts.controlled)
+        if endless := [name for name, end in zip(parts.controlled, upper, strict=True) if math.isinf(end)]:
+            text = f"joint {endless[0]!r} turns without end, but the frames of its motor hold positions of a few turns"
+            way = 'make it type="revolute" with limits in the URDF'
+            raise OpenArmError(Code.CONFIG_INVALID, f"{text}; {way}")
         speed = [description.joint(name).velocity for name in parts.controlled]
         for i, joint in enumerate(parts.joints):
             found.append(

@@ -27,6 +27,7 @@ from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.meshes import take_meshes
 from openarm_common.robot.motors import JointMotion, Motors
 from openarm_common.robot.srdf import Semantics, parse_srdf, shifted
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf, rewritten
 from openarm_common.robot.xacro_files import description_text
 from openarm_common.robot.xml_text import fault, parse_root
@@ -297,10 +298,20 @@ class RobotDescription:
         """Pairs of links whose contact is not checked."""
         return self.semantics.allowed_collisions
 
-    def limits(self, joint_names: Iterable[str]) -> tuple[Array, Array]:
-        """Return the lower and upper position limits (n,) of joints."""
+    def limits(self, joint_names: Iterable[str], endless: float = math.inf) -> tuple[Array, Array]:
+        """Return the lower and upper position limits (n,) of joints; `endless` are those of one that has none, rad."""
         found = [self.joint(name) for name in joint_names]
-        return np.array([j.lower for j in found]), np.array([j.upper for j in found])
+        lower, upper = np.array([j.lower for j in found]), np.array([j.upper for j in found])
+        return np.where(np.isinf(lower), -endless, lower), np.where(np.isinf(upper), endless, upper)
+
+    def away(self, posture: Mapping[str, float], q: Mapping[str, float]) -> float:
+        """Return how far the joint that is furthest from a posture is from it, rad or m, by the shortest way.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, as `joint`.
+        """
+        there, here = (np.array([at[name] for name in posture]) for at in (posture, q))
+        return float(np.abs(nearest_turns(there, here, self.limits(posture)[1]) - here).max())
 
     def joint(self, name: str) -> Joint:
         """Return a joint.

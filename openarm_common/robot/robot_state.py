@@ -28,6 +28,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 
 TOLERANCE_NS = 5_000_000
@@ -61,6 +62,7 @@ class RobotStateBuffer:
 
     def __init__(self, description: RobotDescription, capacity: int = 400) -> None:
         self._description = description
+        self._endless = [name for name, joint in description.joints.items() if joint.type == "continuous"]
         self._states: deque[_State] = deque(maxlen=capacity)
         self._static: dict[str, tuple[str, Array]] = {}
         self._levers_of: dict[tuple[str, tuple[str, ...]], Array] = {}
@@ -70,7 +72,8 @@ class RobotStateBuffer:
     ) -> None:
         """Add one joint state; time going back (a restarted simulation) empties the buffer first.
 
-        A second one at the same stamp, of another publisher, is added to the first.
+        A second one at the same stamp, of another publisher, is added to the first. Joints that turn without end go on
+        from the last state, whatever turn an encoder starts again with.
 
         Args:
             t_ns: Stamp.
@@ -85,6 +88,9 @@ class RobotStateBuffer:
         v = dict(zip(names, velocities, strict=False)) if any(velocities) else {}
         if not math.isfinite(sum(v.values())):
             v = {}
+        for name in self._endless if self._states else ():
+            if name in q and name in self._states[-1].q:
+                q[name] = float(nearest_turns(q[name], self._states[-1].q[name], math.inf))
         if self._states and t_ns == self._states[-1].t_ns:  # of another publisher
             last = self._states.pop()
             q, v = {**last.q, **q}, {**last.v, **v}

@@ -55,7 +55,7 @@ class ArmLoad:
         whole = pin.buildModelFromXML(description.urdf)
         others = [i for i, name in enumerate(whole.names) if i > 0 and name not in joints]
         self._model = pin.buildReducedModel(whole, others, pin.neutral(whole))
-        self._data = self._model.createData()
+        self._data, self._zero = self._model.createData(), pin.neutral(self._model)
         self._order = [self._model.joints[self._model.getJointId(name)].idx_v for name in joints]
         self._tool = self._model.getFrameId(tool)
         #: Viscous damping of the description, N m s/rad.
@@ -65,7 +65,7 @@ class ArmLoad:
 
     def torque(self, q: Array, v: Array, a: Array) -> Array:
         """Return the torques (k,) of a motion without friction and armature."""
-        tau: Array = np.array(pin.rnea(self._model, self._data, self._full(q), self._full(v), self._full(a)))
+        tau: Array = np.array(pin.rnea(self._model, self._data, self._at(q), self._full(v), self._full(a)))
         return tau[self._order]
 
     def torque_of_mass(self, q: Array) -> Array:
@@ -89,15 +89,19 @@ class ArmLoad:
         rng, found, held = np.random.default_rng(0), list[Array](), list[Array]()
         for _ in range(n):
             q = rng.uniform(lower, upper)
-            found.append(np.diag(pin.crba(self._model, self._data, self._full(q)))[self._order])
+            found.append(np.diag(pin.crba(self._model, self._data, self._at(q)))[self._order])
             held.append(mass * np.sum(self._jacobian(q) ** 2, axis=0))
         return np.stack([np.min(found, axis=0), np.median(found, axis=0), np.max(np.add(found, held), axis=0)])
 
     def _jacobian(self, q: Array) -> Array:
         """Translation of the tool by joint, (3, k), m/rad."""
         frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        jacobian: Array = np.array(pin.computeFrameJacobian(self._model, self._data, self._full(q), self._tool, frame))
+        jacobian: Array = np.array(pin.computeFrameJacobian(self._model, self._data, self._at(q), self._tool, frame))
         return jacobian[:3, self._order]
+
+    def _at(self, q: Array) -> Array:
+        """Configuration of the model, which has cosine and sine of a joint that turns without end."""
+        return np.asarray(pin.integrate(self._model, self._zero, self._full(q)))
 
     def _full(self, values: Array) -> Array:
         full = np.empty(self._model.nv)

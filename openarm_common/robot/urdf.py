@@ -229,7 +229,9 @@ def _joint(element: ET.Element) -> Joint:
     name = attribute(element, "name")
     kind = attribute(element, "type")
     if kind not in get_args(JointType):
-        raise fault(f"joint {name!r} has type {kind!r}; supported: {', '.join(get_args(JointType))}")
+        known = f"joint {name!r} has type {kind!r}; supported: {', '.join(get_args(JointType))}"
+        why = '; arms stand on a base that does not move: write type="fixed", or leave out joint and parent link'
+        raise fault(known + why * (kind in ("planar", "floating")))
     axis_element, limit, mimic = element.find("axis"), element.find("limit"), element.find("mimic")
     if kind == "fixed":  # neither says anything about a joint that does not move
         axis_element = mimic = None

@@ -57,7 +57,7 @@ class DynamicsBench:
         collides = arm.scene(self._state(), ()).collides
         rng = np.random.default_rng(0)
         home, logs = np.array([self._state()[name] for name in arm.names]), list[ServoLog]()
-        for posture in postures(*description.limits(arm.names), load, lambda q: not collides(q), _POSTURES, rng):
+        for posture in postures(*description.limits(arm.names, np.pi), load, lambda q: not collides(q), _POSTURES, rng):
             try:
                 self._go(arm, posture)
             except OpenArmError:

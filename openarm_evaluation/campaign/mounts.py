@@ -122,7 +122,7 @@ class Bench:
         Raises:
             OpenArmError: From the detector, when the board is hardly ever visible.
         """
-        lower, upper = self._description.limits(self.samples.joint_names)
+        lower, upper = self._description.limits(self.samples.joint_names, np.pi)
         middle = self._middle()
         missed = 0
         while len(self.samples) < count:
@@ -154,7 +154,7 @@ class Bench:
             OpenArmError: NOTHING_DETECTED, when there is none.
         """
         rng = np.random.default_rng(0)
-        lower, upper = self._description.limits(self.samples.joint_names)
+        lower, upper = self._description.limits(self.samples.joint_names, np.pi)
         found = list[tuple[int, Array]]()
         for _ in range(tries):
             q = rng.uniform(lower + 0.1, upper - 0.1)

@@ -153,8 +153,8 @@ class CoordinatedRobot:
         return np.array([q[name] for name in self._homes[arm]])
 
     def _is_home(self, arm: str) -> bool:
-        off = np.abs(self._pose(arm) - np.array(list(self._homes[arm].values())))
-        return float(np.max(off)) <= self._config.home_tolerance
+        _, q = self._robot.states.latest()
+        return self._robot.description.away(self._homes[arm], q) <= self._config.home_tolerance
 
     def _other_is_away(self) -> bool:
         return self._other in self._coordination.done or self._is_home(self._other)

@@ -327,7 +327,7 @@ class Skills:
                 continue
             home = robot.description.group_state(f"{arm}_arm", config.home_state)
             _, q = robot.states.latest()
-            if max(abs(q[name] - value) for name, value in home.items()) <= config.home_tolerance:
+            if robot.description.away(home, q) <= config.home_tolerance:
                 continue
             T_base_tcp = self._hands[arm].T_base_tcp()
             if T_base_tcp[2, 3] < back_off_below:

@@ -59,8 +59,10 @@ class CollisionRobot:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no link moved by {kinematics.names} has a collision shape")
         self._joint_of = {name: self.model.joints[i] for i, name in enumerate(self.model.names) if i > 0}
         self.joints: tuple[int, ...] = tuple(self.model.getJointId(name) for name in kinematics.names)
-        self._columns = np.array([self._joint_of[name].idx_q for name in kinematics.names])
-        self._endless = any(self._joint_of[name].nq != 1 for name in kinematics.names)
+        mine = [self._joint_of[name] for name in kinematics.names]
+        self._columns = np.array([joint.idx_q for joint in mine])
+        #: Columns of the cosines of those that turn without end, which pinocchio keeps as cosine and sine.
+        self._cosines = np.array([joint.idx_q for joint in mine if joint.nq == 2], np.int64)
         self.pairs, self.touching = self._pairs_to_check(description)
         # pinocchio searches all pairs for each that it is given: once is enough
         fixed_or_moving = self.arm.fixed | self.arm.moving
@@ -84,11 +86,10 @@ class CollisionRobot:
 
     def put(self, full: Array, q: ArrayLike) -> None:
         """Write the arm's joints (n,) into a full configuration."""
-        if not self._endless:
-            full[self._columns] = q
-            return
-        for name, value in zip(self.kinematics.names, np.asarray(q, dtype=np.float64), strict=True):
-            self._set(full, name, float(value))
+        full[self._columns] = q
+        if self._cosines.size:
+            angles = full[self._cosines]
+            full[self._cosines], full[self._cosines + 1] = np.cos(angles), np.sin(angles)
 
     def on_tool(self, boxes: Sequence[Box]) -> list[tuple[int, Box]]:
         """Boxes in the tool frame as `CollisionContext.carried` of the other arm."""

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from openarm_common.errors import Code
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.constraints.regions import PositionRegion, Region
 from openarm_motion.planning.arm import Arm, Scale, segment_time
@@ -64,7 +65,7 @@ def _joints(arm: Arm, region: Region, start: Array) -> Array:
         i = arm.names.index(interval.joint)
         low, high = interval.position - interval.below, interval.position + interval.above
         q[i] = min(max(interval.position, min(arm.lower[i], high)), max(arm.upper[i], low))
-    return arm.configuration(q, "goal", 1e-3)
+    return nearest_turns(arm.configuration(q, "goal", 1e-3), start, arm.upper)
 
 
 def _poses(arm: Arm, region: Region, start: Array) -> Iterator[tuple[Array, bool]]:

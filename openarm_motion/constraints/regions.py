@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 
 #: What inverse kinematics and rounding may leave, added to every tolerance: m, rad.
@@ -25,13 +26,19 @@ POSE_M, POSE_RAD = 1e-3, 1e-3
 
 @dataclass(frozen=True)
 class JointInterval:
-    """Position of a joint, and how far it may be above and below, rad or m; `weight` as in `Region.weights`."""
+    """Position of a joint, and how far it may be above and below, rad or m.
+
+    Attributes:
+        weight: As in `Region.weights`.
+        upper: Upper limit of the joint; infinite where whole turns make no difference.
+    """
 
     joint: str
     position: float
     above: float
     below: float
     weight: float = 1.0
+    upper: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse numbers that are no interval.
@@ -181,7 +188,8 @@ class Region:
         """
         out: list[tuple[str, Array]] = []
         for interval in self.joints:
-            x = states[:, list(names).index(interval.joint)] - interval.position
+            middle = interval.position + 0.5 * (interval.above - interval.below)
+            x = nearest_turns(states[:, list(names).index(interval.joint)], middle, interval.upper) - interval.position
             beyond = np.maximum(np.maximum(x - interval.above, -x - interval.below), 0.0)
             out.append((f"rad of {interval.joint}", np.where(beyond > _SLACK_RAD, beyond, 0.0)))
         for position in self.positions:

@@ -18,11 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.bodies import Bodies
 from openarm_common.robot.description import Joint, RobotDescription
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.kinematics import chain_kernels as kernels
 
-#: Continuous joints have no limits; a seed and a search still need a range.
-_CONTINUOUS = np.pi
 #: Guesses for the nearest configuration to what is out of reach.
 _OUT_OF_REACH = 4
 
@@ -105,10 +104,9 @@ class ArmKinematics:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no joint moves the tool link {tool_link!r}")
         self.tool_link = tool_link
         self.names: tuple[str, ...] = tuple(names)
-        lower, upper = description.limits(self.names)
-        unlimited = ~(np.isfinite(lower) & np.isfinite(upper))
-        self.lower: Array = np.where(unlimited, -_CONTINUOUS, lower)
-        self.upper: Array = np.where(unlimited, _CONTINUOUS, upper)
+        #: Limits, infinite for joints that turn without end, and the same with half a turn in their place.
+        self.lower, self.upper = description.limits(self.names)
+        self.span = description.limits(self.names, np.pi)
         self.placements: Array = np.array(placements)
         self.axes: Array = np.array(axes)
         self.prismatic: NDArray[np.bool_] = np.array(kinds)
@@ -122,6 +120,11 @@ class ArmKinematics:
     def n(self) -> int:
         """Number of joints."""
         return len(self.names)
+
+    @property
+    def middle(self) -> Array:
+        """Middle (n,) of the limits; 0 of a joint that has none."""
+        return 0.5 * (self.span[0] + self.span[1])
 
     @property
     def chain(self) -> tuple[Array, Array, NDArray[np.bool_], Array]:
@@ -184,13 +187,14 @@ class ArmKinematics:
 
         Args:
             target: (4, 4) `T_base_tool`.
-            seed: (n,) first guess, which redundant motion is pulled towards; default the middle of the limits.
+            seed: (n,) first guess, which redundant motion is pulled towards, and in the turn of which joints without
+                end are; default the middle of the limits.
             position_only: The orientation of the target is ignored.
             margin: Kept from every joint limit, rad.
             tolerance: Position (m) and orientation (rad).
             restarts: Random guesses after the first, the same each time; every other one near the limits.
         """
-        middle = 0.5 * (self.lower + self.upper)
+        middle = self.middle
         first = middle if seed is None else np.asarray(seed, dtype=np.float64)
         best = np.empty(self.n)
         if self.beyond(target, tolerance[0]):
@@ -206,7 +210,7 @@ class ArmKinematics:
             *self.chain,
             best,
         )
-        return IkResult(bool(success), best, float(error_p), float(error_r))
+        return IkResult(bool(success), nearest_turns(best, first, self.upper), float(error_p), float(error_r))
 
     def _forward(self, q: ArrayLike) -> tuple[Array, Array, Array]:
         values = np.ascontiguousarray(q, dtype=np.float64)

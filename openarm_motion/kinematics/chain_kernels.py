@@ -162,6 +162,9 @@ def _draw(lower: Array, upper: Array, at_limits: bool, x: Array) -> None:
     """Draw a guess, uniform within the limits; `at_limits` puts about two joints of three on one of theirs."""
     for i in range(x.shape[0]):
         u = np.random.random()
+        if math.isinf(upper[i]):
+            x[i] = math.pi * (2.0 * u - 1.0)
+            continue
         if at_limits:
             u = min(1.0, max(0.0, 3.0 * u - 1.0))
         x[i] = lower[i] + (upper[i] - lower[i]) * u
@@ -191,7 +194,7 @@ def solve_ik(
         position_only: Ignore the rotation.
         tolerance: Position (m) and rotation (rad).
         restarts: Further guesses after the first.
-        lower: (n,) limits.
+        lower: (n,) limits; infinite ones for a joint that turns without end.
         upper: (n,) limits.
         placements: Chain, see the module's head.
         axes: Chain.

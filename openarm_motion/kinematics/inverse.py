@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from openarm_common.errors import OpenArmError
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.kinematics.chain import ArmKinematics, IkResult, Solution
 from openarm_motion.kinematics.srs import SrsArm, SrsMiss
@@ -59,7 +60,8 @@ class InverseKinematics:
         Args:
             pose: (4, 4).
             margin: Kept from the limits, rad.
-            near: (n,) A first guess where solving is numeric, and one more swivel angle to try where it is not.
+            near: (n,) A first guess where solving is numeric, and one more swivel angle to try where it is not; joints
+                that turn without end are in the turn nearest to it.
         """
         return self._search(pose, margin, near).found
 
@@ -81,7 +83,7 @@ class InverseKinematics:
             first, found = search.nearest or first, search.found
         if first.success or not found:
             return first
-        here = 0.5 * (arm.lower + arm.upper) if seed is None else np.asarray(seed, dtype=np.float64)
+        here = arm.middle if seed is None else np.asarray(seed, dtype=np.float64)
         best = min(found, key=lambda solution: float(np.max(np.abs(solution.q - here))))
         return arm.ik(pose, best.q, position_only=position_only, margin=margin, restarts=0)
 
@@ -125,7 +127,7 @@ class InverseKinematics:
         """
         if self._closed is not None:
             swivels = start.swivel + swivel_change * np.linspace(0.0, 1.0, poses.shape[0])
-            return self._closed.follow(poses, swivels, start.branch, margin, max_step)
+            return self._closed.follow(poses, swivels, start, margin, max_step)
         path = np.empty((poses.shape[0], self.kinematics.n))
         q = start.q
         for k, pose in enumerate(poses):
@@ -154,7 +156,7 @@ class InverseKinematics:
         swivels = self._swivels if near is None else np.concatenate([[closed.swivel(near)], self._swivels])
         found = closed.sweep(pose, swivels, margin)
         if found:
-            return _Search(found)
+            return _Search(self._near(found, near))
         miss = closed.miss(pose, swivels, margin)
         arm = self.kinematics
         results = [arm.ik(pose, guess, margin=margin, restarts=0) for guess in miss.nearest]
@@ -162,7 +164,17 @@ class InverseKinematics:
             restarts = _OUT_OF_REACH if abs(miss.too_far) > _ROUNDED else _RESTARTS
             results.append(arm.ik(pose, near, margin=margin, restarts=restarts))
         best = min(results, key=lambda result: result.cost)
-        return _Search([closed.classify(result.q) for result in results if result.success], best, miss)
+        solved = [closed.classify(result.q) for result in results if result.success]
+        return _Search(self._near(solved, near), replace(best, q=self._turned(best.q, near)), miss)
+
+    def _near(self, found: list[Solution], near: ArrayLike | None) -> list[Solution]:
+        """The same configurations, in the turns nearest to another one."""
+        if not np.isinf(self.kinematics.upper).any():
+            return found
+        return [replace(solution, q=self._turned(solution.q, near)) for solution in found]
+
+    def _turned(self, q: Array, near: ArrayLike | None) -> Array:
+        return nearest_turns(q, self.kinematics.middle if near is None else near, self.kinematics.upper)
 
     def _numeric(self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool) -> _Search:
         found = self._several(pose, margin, near, position_only=position_only)
@@ -178,12 +190,13 @@ class InverseKinematics:
             return []
         rng = np.random.default_rng(0)
         seeds = [] if near is None else [np.asarray(near, dtype=np.float64)]
-        seeds += [0.5 * (arm.lower + arm.upper), *rng.uniform(arm.lower, arm.upper, (_GUESSES, arm.n))]
+        seeds += [arm.middle, *rng.uniform(*arm.span, (_GUESSES, arm.n))]
         found: list[Solution] = []
         for seed in seeds:
             result = arm.ik(pose, seed, position_only=position_only, margin=margin, restarts=0)
-            if result.success and all(float(np.max(np.abs(result.q - s.q))) > _SAME for s in found):
-                found.append(Solution(result.q))
+            q = self._turned(result.q, near)
+            if result.success and all(float(np.max(np.abs(q - s.q))) > _SAME for s in found):
+                found.append(Solution(q))
         return found
 
     def _binding(self, miss: SrsMiss, closed: SrsArm) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.kinematics import srs_intervals, srs_kernels
 from openarm_motion.kinematics.chain import ArmKinematics, Solution, digits
@@ -21,6 +22,8 @@ from openarm_motion.kinematics.chain import ArmKinematics, Solution, digits
 #: How far the axes may miss each other: a rounded rpy in the URDF costs 4e-6 m.
 _MEET = 2e-5
 _PERPENDICULAR = 1e-4
+#: Limits of joints that turn without end, as the kernels take them: whole turns are left to their callers, rad.
+_MANY_TURNS = 1e6
 #: A wrist out of reach by less is brought into reach for a first guess, m.
 _NEAR_REACH = 1e-3
 
@@ -52,7 +55,8 @@ class SrsArm:
     def __init__(self, kinematics: ArmKinematics) -> None:
         self.kinematics = kinematics
         self._geometry, self._tool = _read_geometry(kinematics)
-        self._lower, self._upper = kinematics.lower, kinematics.upper
+        self._lower = np.maximum(kinematics.lower, -_MANY_TURNS)
+        self._upper = np.minimum(kinematics.upper, _MANY_TURNS)
         self._verify()
 
     @property
@@ -96,9 +100,9 @@ class SrsArm:
         return SrsMiss(excess, best[order[np.isfinite(least[order])]])
 
     def follow(
-        self, poses: Array, swivels: Array, branch: int, margin: float, max_step: float
+        self, poses: Array, swivels: Array, start: Solution, margin: float, max_step: float
     ) -> tuple[Array, int, str]:
-        """Configurations (m, 7) along poses (m, 4, 4) at swivel angles (m,), on one branch.
+        """Configurations (m, 7) along poses (m, 4, 4) at swivel angles (m,), on the branch of `start`.
 
         Returns:
             The path, the index of the first pose that fails (m when none does), and why it fails.
@@ -107,7 +111,8 @@ class SrsArm:
         index, status, joint = srs_kernels.follow(
             _c(poses),
             _c(swivels),
-            branch,
+            _c(start.q),
+            start.branch,
             self._geometry,
             self._tool,
             self._lower + margin,
@@ -139,7 +144,7 @@ class SrsArm:
             candidate = self.solve(pose, swivel, branch)
             if candidate is None:
                 continue
-            distance = float(np.max(np.abs(candidate - values)))
+            distance = float(np.max(np.abs(nearest_turns(candidate, values, np.inf) - values)))
             if distance < least:
                 best, least = branch, distance
         return Solution(values, swivel, best)
@@ -180,7 +185,7 @@ class SrsArm:
         """Solve a few poses and compare with forward kinematics: a wrong assumption must not pass as a wrong grasp."""
         rng = np.random.default_rng(0)
         for _ in range(8):
-            q = rng.uniform(self._lower, self._upper)
+            q = rng.uniform(*self.kinematics.span)
             pose = self.kinematics.fk(q)
             solution = self.solve(pose, self.swivel(q), self.classify(q).branch)
             error = np.inf if solution is None else float(np.max(np.abs(self.kinematics.fk(solution) - pose)))
@@ -212,7 +217,7 @@ def _read_geometry(kinematics: ArmKinematics) -> tuple[Array, Array]:
     upper, fore = elbow - shoulder, wrist - elbow
     if min(float(np.linalg.norm(upper)), float(np.linalg.norm(fore))) < 1e-3:
         raise _not_srs("the elbow axis goes through the shoulder or the wrist centre")
-    middle = 0.5 * (kinematics.lower[3] + kinematics.upper[3])
+    middle = kinematics.middle[3]
     K = np.cross(np.eye(3), w4).T
     turned = fore + np.sin(middle) * K @ fore + (1.0 - np.cos(middle)) * K @ K @ fore
     bend = float(np.sign(upper @ np.cross(w4, upper + turned))) or 1.0

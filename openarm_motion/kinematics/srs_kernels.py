@@ -301,6 +301,7 @@ def _excess(q: Array, lower: Array, upper: Array) -> tuple[float, int]:
 def follow(
     poses: Array,
     swivels: Array,
+    start: Array,
     branch: int,
     geometry: Array,
     tool: Array,
@@ -311,6 +312,8 @@ def follow(
 ) -> tuple[int, int, int]:
     """Solve a path of poses (m, 4, 4) on one branch at the swivel angles (m,); fills `path` (m, 7).
 
+    Each angle is given in the turn nearest to the one before, the first to that of `start` (7,), where limits let it.
+
     Returns:
         Index of the first pose that fails (m when none does), why (0, TOO_FAR, TOO_NEAR, LIMIT, JUMP), and the joint.
     """
@@ -318,6 +321,11 @@ def follow(
         status = solve(poses[k], swivels[k], branch, geometry, tool, lower, upper, path[k])
         if status != 0:
             return k, status, 0
+        before = path[k - 1] if k > 0 else start
+        for i in range(7):
+            q = path[k, i] - 2.0 * math.pi * math.floor((path[k, i] - before[i]) / (2.0 * math.pi) + 0.5)
+            if lower[i] <= q <= upper[i]:
+                path[k, i] = q
         worst, joint = _excess(path[k], lower, upper)
         if worst > 1e-9:
             return k, LIMIT, joint

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.collision.exact import CollisionScene
 from openarm_motion.planning import moves
@@ -95,7 +96,7 @@ def near_joints(
 ) -> Alternative | None:
     """The configuration nearest to `goal`, on the way back to the start, that the arm can be planned to."""
     end = time.monotonic() + budget
-    scene = moves.free_scene(arm, now, around)
+    scene, goal = moves.free_scene(arm, now, around), nearest_turns(goal, now.start, arm.upper)
     wanted = arm.kinematics.fk(goal)
     for u in np.linspace(1.0, 0.0, _STEPS, endpoint=False):
         if time.monotonic() > end or now.stopped():

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.collision.exact import CollisionScene, Contact
 from openarm_motion.collision.solids import Box
@@ -283,7 +284,10 @@ class _Checks:
             best = left.pop(free.path.goal)
             pose = targets[best.target].pose
             self._arrange(pose)
-            approach, retreat = (arm.time_line(line, now.scale) for line in (best.approach, best.retreat))
+            # the transfer may end whole turns away from where the lines were solved
+            whole = nearest_turns(best.approach.q[0], free.trajectory.q[-1], arm.upper) - best.approach.q[0]
+            lines = (replace(line, q=line.q + whole) for line in (best.approach, best.retreat))
+            approach, retreat = (arm.time_line(line, now.scale) for line in lines)
             what = "approach"
             try:
                 validate_trajectory(self._approach, approach)

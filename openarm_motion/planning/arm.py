@@ -20,6 +20,7 @@ import numpy as np
 from openarm_common.collision.held_apart import held_apart
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.turns import nearest_turns, other_ways
 from openarm_common.types import Array
 from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene, Contact
 from openarm_motion.collision.fast import FastScene
@@ -93,7 +94,7 @@ class PlanningGroup(ABC):
         title: For messages, for example "the left arm".
         config: Parameters.
         names: The joints.
-        lower: (n,) joint limits.
+        lower: (n,) joint limits, infinite for a joint that turns without end.
         upper: (n,) joint limits.
         direct: Whether straight joint lines are tried before the planner is asked.
     """
@@ -125,11 +126,12 @@ class PlanningGroup(ABC):
         """What a planner is asked for a path to one of several goals (k, n); steps are `fineness` times finer."""
         search, limits = self.config.planning, self.limits(now.scale)
         step, travel = search.edge_step / fineness, search.edge_travel / fineness
+        ends = np.vstack([now.start, goals])
         return PlanQuery(
             start=now.start,
             goals=goals,
-            lower=self.lower,
-            upper=self.upper,
+            lower=np.where(np.isinf(self.lower), ends.min(axis=0) - np.pi, self.lower),
+            upper=np.where(np.isinf(self.upper), ends.max(axis=0) + np.pi, self.upper),
             collides=scene.collides,
             edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
             time_limit=time_limit,
@@ -154,11 +156,12 @@ class PlanningGroup(ABC):
         Where the straight joint line to one of the first goals keeps the full clearance all the way, there is nothing
         to search. Where the validation finds what the search stepped over, the search is repeated with finer steps.
         What is no straight line is searched for once with each of the start's seeds, as far as time allows.
+        Joints that turn without end go the short way, and the other way only where the search finds no path.
 
         Args:
             scene: What it keeps clear of.
             now: Where it starts.
-            goals: (k, n) rad.
+            goals: (k, n) rad, joints that turn without end in any turn.
             time_limit: s.
             validate: Raises `PlanFailedError` for a trajectory in a scene; None is `validate_trajectory`.
 
@@ -166,6 +169,7 @@ class PlanningGroup(ABC):
             OpenArmError: as `plan`; IN_COLLISION, when the finest search did not help.
         """
         end = time.monotonic() + time_limit
+        goals = nearest_turns(goals, now.start, self.upper)
         direct = self._direct(scene, now, goals) if self.direct else None
         if direct is not None and validate is None:
             return direct
@@ -190,7 +194,7 @@ class PlanningGroup(ABC):
         """One plan: as `plan_validated`, with an end on the monotonic clock, s, and a straight line to try first."""
         fault, contact = "", None
         for fineness in _FINENESS:
-            path = direct.path if direct else self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
+            path = direct.path if direct else self._free_path(scene, now, goals, end, fineness)
             direct = None
             timing, left = self.timing(path, now.scale), True
             while left:
@@ -206,6 +210,19 @@ class PlanningGroup(ABC):
     def straight(self, now: StartState, goal: Array) -> Trajectory:
         """The straight joint line from the start to a configuration (n,), timed and not checked."""
         return self.timing(PlannedPath(np.stack([now.start, goal]), 0, 0), now.scale).trajectory()
+
+    def _free_path(self, scene: LineChecks, now: StartState, goals: Array, end: float, fineness: float) -> PlannedPath:
+        """Free path to one of the goals (k, n), the short way or the other way of a joint that turns without end."""
+        others, left = other_ways(goals, now.start, self.upper), max(end - time.monotonic(), 0.1)
+        if not len(others):
+            return self.plan(scene, now, goals, left, fineness)
+        try:
+            return self.plan(scene, now, goals, 0.5 * left, fineness)
+        except OpenArmError as error:
+            if error.code != Code.NO_PLAN:
+                raise
+        path = self.plan(scene, now, others, 0.5 * left, fineness)
+        return replace(path, goal=path.goal % len(goals))
 
     def _direct(self, scene: LineChecks, now: StartState, goals: Array) -> ValidatedPlan | None:
         """The straight joint line to one of the first goals, where it is free all the way on the exact layer."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.config import ServoConfig
 from openarm_motion.servo.course import Course, JointState
@@ -144,6 +145,8 @@ class ArmServo:
             A trajectory that ends at rest, and the stamp of its beginning; None: go on with the last one.
         """
         wanted, is_twist = self._wanted(wall)
+        if self._set_points:
+            measured = measured[0], nearest_turns(measured[1], self._set_points[-1][1], self.arm.upper)
         if self._course is None and wanted is None:
             return None
         lead_ns = round((_LEAD if self._course is not None else _FIRST_LEAD) * 1e9)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.turns import nearest_turns
 from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
 from openarm_motion.timing.trajectory import Motion
 
@@ -36,7 +37,7 @@ def check_trajectory(arm: Arm, motion: Motion, state: Mapping[str, float]) -> Mo
         state: Present positions by joint name.
 
     Returns:
-        The motion, columns in the arm's order.
+        The motion, columns in the arm's order, joints that turn without end in the turn that they are in.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT or LIMITS, with the joint, the point and the value.
@@ -76,6 +77,7 @@ def check_trajectory(arm: Arm, motion: Motion, state: Mapping[str, float]) -> Mo
             f"{arm.names[i]} at point {k} moves at {speed[k, i]:.2f} rad/s, limit {fastest[i] / _SLACK:.2f}",
         )
     now = np.array([state[name] for name in arm.names])
+    q = q + (nearest_turns(q[0], now, arm.upper) - q[0])
     gap = np.abs(q[0] - now)
     i = int(np.argmax(gap))
     if gap[i] > arm.config.execution.start_tolerance:

@@ -85,7 +85,9 @@ class AdoptedUrdf:
             name = joint.get("name", "")
             span = matching(edits.range, name, None)
             said = {key: matching(getattr(edits, key), name, None) for key in ("velocity", "effort")}
-            said |= {} if span is None or joint.get("type") == "continuous" else {"lower": span[0], "upper": span[1]}
+            if span is not None:
+                said |= {"lower": span[0], "upper": span[1]}
+                joint.set("type", "prismatic" if joint.get("type") == "prismatic" else "revolute")
             values = {key: f"{value:.13g}" for key, value in said.items() if value is not None}
             if values or joint.find("limit") is not None:
                 # urdfdom reads no joint without the limits of effort and velocity; 0: not known

@@ -172,6 +172,9 @@ def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> tuple[
     moved = [] if leader is None else [leader, *followers[leader.name]]
     others = [joint.name for joint in beyond if joint not in moved]
     remarks: list[str] = []
+    if endless := [joint.name for joint in joints if joint.type == "continuous"]:
+        way = f"where a cable forbids that, write `range: {{{endless[0]}: [LOWER, UPPER]}}` in --edits and draft again"
+        remarks.append(f"arms.{name}: joints that turn without end: {', '.join(endless)}; {way}")
     if leader is not None and others:
         what = f"arms.{name}: finger_joint {leader.name!r} is a guess; further joints of the hand: {', '.join(others)}"
         way = "couple to it what follows it, by <mimic> of a URDF, or mimic and fixed of edits of an MJCF"

@@ -102,7 +102,7 @@ class Edits(Config):
         fixed: Joints that do not move, of linkages that a tree can't have.
         velocity: Limits by joint, rad/s or m/s; an MJCF has none.
         effort: Limits by joint in place of the MJCF's, N m or N.
-        range: The same of positions, such as those that cables leave, rad or m.
+        range: The same of positions, such as those that cables leave, rad or m; with them no joint turns without end.
         damping: By joint in place of the MJCF's, N m s/rad or N s/m.
         boxes: All shapes of a link, seen and touched.
         hulls: Links that collide where they are seen: hulls of their visual meshes in place of the MJCF's shapes.

@@ -114,12 +114,16 @@ class UrdfDraft:
                 faults.append(f"body {self._names[body]!r} has {count} joints, expected at most 1")
             for k in range(first, first + count):
                 kind, name = int(model.jnt_type[k]), _joint_name(model, k)
-                if kind not in (_JOINT.mjJNT_HINGE, _JOINT.mjJNT_SLIDE):
-                    faults.append(f"joint {name!r} is neither a hinge nor a slide")
+                if self._is_fixed(k):
+                    pass
+                elif kind not in (_JOINT.mjJNT_HINGE, _JOINT.mjJNT_SLIDE):
+                    way = f"where the robot stands still, write `fixed: [{name}]` in edits"
+                    faults.append(f"joint {name!r} is neither a hinge nor a slide; {way}")
                 elif model.qpos0[model.jnt_qposadr[k]] != 0.0:
                     faults.append(f"joint {name!r} has ref {float(model.qpos0[model.jnt_qposadr[k]])}, expected 0")
-                elif kind == _JOINT.mjJNT_SLIDE and not model.jnt_limited[k]:
-                    faults.append(f"joint {name!r} slides without limits")
+                elif kind == _JOINT.mjJNT_SLIDE and not self._is_limited(k):
+                    way = f"write `range: {{{name}: [LOWER, UPPER]}}` in edits"
+                    faults.append(f"joint {name!r} slides without limits; {way}")
                 self._offsets[body] = model.jnt_pos[k]
         geoms = {model.geom(k).name for k in range(model.ngeom)}
         geoms |= {f"{name}_{piece:02d}_{tag}" for name in self._names for piece in range(99) for tag in _TAGS}
@@ -174,6 +178,9 @@ class UrdfDraft:
 
     def _is_fixed(self, joint: int) -> bool:
         return matches(self._edits.fixed, _joint_name(self._model, joint))
+
+    def _is_limited(self, joint: int) -> bool:
+        return bool(self._model.jnt_limited[joint]) or matches(self._edits.range, _joint_name(self._model, joint))
 
     def _place(self, frame: FrameEdit) -> tuple[str, Array]:
         """Parent link and pose (4, 4) of a frame."""
@@ -262,7 +269,7 @@ class UrdfDraft:
 
     def _joint(self, k: int, parent: str, child: str, T: Array) -> None:
         model, name = self._model, _joint_name(self._model, k)
-        limited = bool(model.jnt_limited[k])
+        limited = self._is_limited(k)
         turns = int(model.jnt_type[k]) == _JOINT.mjJNT_HINGE
         kind = ("revolute" if limited else "continuous") if turns else "prismatic"
         element = _joint_element(self._root, name, kind, parent, child, T)

@@ -35,6 +35,16 @@ def buffer() -> RobotStateBuffer:
     return RobotStateBuffer(RobotDescription.from_urdf(URDF))
 
 
+def test_a_joint_without_end_goes_on_where_its_encoder_starts_again() -> None:
+    for kind, last in (("continuous", 3.18), ("revolute", 3.18 - math.tau)):
+        buffer = RobotStateBuffer(RobotDescription.from_urdf(URDF.replace("prismatic", kind)))
+        for k, q in enumerate((3.10, 3.12, 3.14, 3.16 - math.tau, 3.18 - math.tau)):
+            buffer.add_joint_state(k * 10 * MS, ["lift"], [q])
+        assert buffer.latest()[1]["lift"] == pytest.approx(last)
+        if kind == "continuous":
+            assert buffer.joints_at(25 * MS)["lift"] == pytest.approx(3.15)
+
+
 @given(st.integers(0, 10 * MS))
 @pytest.mark.requirement("A-44")
 def test_interpolates_between_two_that_bracket(t_ns: int) -> None:

@@ -27,9 +27,15 @@ START = 1_000 * MS
 class Arm:
     """A follower and the joints it moves; `plant` maps (position, target) to the position a tick later."""
 
-    def __init__(self, plant=lambda q, target: target, config: TrajectoryConfig = CONFIG, lead: float = 0.0) -> None:
+    def __init__(
+        self,
+        plant=lambda q, target: target,
+        config: TrajectoryConfig = CONFIG,
+        lead: float = 0.0,
+        group: JointGroup = GROUP,
+    ) -> None:
         servos = ServoModel(np.ones(2), np.full(2, lead), np.zeros(2), np.zeros(2), np.zeros(2))
-        self.follower = TrajectoryFollower(GROUP, config, Carrier(servos, config.carrier), np.zeros(2))
+        self.follower = TrajectoryFollower(group, config, Carrier(servos, config.carrier), np.zeros(2))
         self.plant = plant
         self.q, self.v = np.zeros(2), np.zeros(2)
         self.t_ns = START
@@ -102,6 +108,20 @@ def test_a_start_far_from_the_arm_is_refused_with_joint_and_value(arm: Arm) -> N
 def test_a_first_point_that_cannot_be_reached_in_time_is_refused() -> None:
     error = refused(r"j1 would have to move at 50\.00 rad/s to be at the first point", Arm().start, t=np.array([0.01]))
     assert isinstance(error, TrajectoryError)
+
+
+def test_a_joint_without_end_is_commanded_on_from_where_it_is_whatever_turn_is_asked_for() -> None:
+    far = np.array([np.inf, 2.0])
+    arm = Arm(group=JointGroup(GROUP.names, -far, far, GROUP.max_velocity))
+    arm.start(t=np.array([2.0]), q=np.array([[3.1, 0.0]]))
+    arm.run()
+    arm.start(t=np.array([0.0, 1.0]), q=np.array([[3.1 - 4.0 * np.pi, 0.0], [3.3 - 4.0 * np.pi, 0.5]]))
+    assert arm.run().result is TrajectoryResult.SUCCESSFUL
+    np.testing.assert_allclose(arm.q, [3.3, 0.5])
+    arm.follower.set_target(np.array([-2.5, np.nan]))
+    arm.tick(200)
+    np.testing.assert_allclose(arm.q, [2.0 * np.pi - 2.5, 0.5])
+    assert np.abs(np.diff(np.array(arm.history), axis=0)).max() < 0.04
 
 
 def test_targets_lead_by_lag_times_velocity() -> None:

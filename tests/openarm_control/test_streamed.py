@@ -59,13 +59,13 @@ class Robot:
 class Bench:
     """The loop without its thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, arm: JointGroup = ARM) -> None:
         servos = ServoModel(np.array([50.0]), np.array([2.0]), np.zeros(1), np.zeros(1), np.zeros(1))
         config, effort = TrajectoryConfig(), {"right": np.inf}
         start = JointReadout(0, np.zeros(2), np.zeros(2), np.zeros(2))
         carriers = {"right": Carrier(servos, config.carrier)}
         self.controller = RobotController(
-            {"right": ARM}, {"right": GRIPPER}, ("j1", "f1"), start, effort, config, GripperConfig(), carriers
+            {"right": arm}, {"right": GRIPPER}, ("j1", "f1"), start, effort, config, GripperConfig(), carriers
         )
         self.robot = Robot()
         self.loop = StreamedRobot(self.controller, self.robot, 0.2, lambda _: None)
@@ -102,6 +102,22 @@ def test_without_a_joint_state_nothing_is_commanded_and_a_goal_is_refused(bench:
     bench.ticks(5)
     assert bench.robot.commands == []
     assert refused("no joint state yet", bench.loop.check_able).code is Code.NOT_READY
+
+
+def test_an_encoder_that_starts_again_is_no_jump_and_commands_go_on() -> None:
+    endless = JointGroup(("j1",), np.array([-np.inf]), np.array([np.inf]), np.array([5.0]))
+    bench = Bench(endless)
+    bench.robot.at = np.array([3.0, 0.02])
+
+    def wrap() -> None:
+        bench.robot.at[0] = (bench.robot.at[0] + np.pi) % (2.0 * np.pi) - np.pi
+
+    bench.sets_out(0, q=3.4)
+    bench.ticks(400, wrap)
+    assert [one.end for one in bench.ends] == [End.SUCCEEDED]
+    sent = np.array([command[0] for command in bench.robot.commands])
+    assert sent[-1] == pytest.approx(3.4, abs=1e-3)
+    assert np.abs(np.diff(sent)).max() < 0.05
 
 
 def test_it_begins_where_the_robot_is(bench: Bench) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import errno
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -147,6 +148,16 @@ def test_a_bus_without_motors_is_said_to_be_silent(rig: Callable[..., Rig]) -> N
     assert "neither to frames of CAN FD nor to classic ones; is the arm's power on" in answer.message
     finding = check_motors("unix:/none", wired())
     assert (finding.level, "can't open unix:/none" in finding.observed) == ("error", True)
+
+
+def test_a_joint_that_turns_without_end_is_refused_with_what_to_write() -> None:
+    robot = RobotDescription.load()
+    name = robot.arm_joints(robot.arm_names[0])[6]
+    joint = replace(robot.joint(name), type="continuous", lower=-math.inf, upper=math.inf)
+    error = refused(
+        f'joint {name!r} turns without end, .* type="revolute"', axes_of, load_wiring(), robot._with_joints(joint)
+    )
+    assert error.code is Code.CONFIG_INVALID
 
 
 def test_ids_are_those_of_each_arm_and_doubles_on_a_bus_are_refused() -> None:

@@ -56,12 +56,14 @@ def _serial(name: str, chain: list[tuple[str, tuple[float, ...], tuple[float, ..
     base = '<collision><geometry><cylinder radius="0.08" length="0.1"/></geometry></collision>'
     parts, parent = [f'<link name="base">{base}</link>'], "base"
     for joint, xyz, axis, lower, upper in chain:
+        span = f'lower="{lower}" upper="{upper}"'
         shape = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.06 0.06 0.06"/></geometry></collision>'
         parts.append(f'<link name="{joint}_link">{shape}</link>')
         parts.append(
-            f'<joint name="{joint}" type="revolute"><parent link="{parent}"/><child link="{joint}_link"/>'
+            f'<joint name="{joint}" type="{"continuous" if math.isinf(upper) else "revolute"}">'
+            f'<parent link="{parent}"/><child link="{joint}_link"/>'
             f'<origin xyz="{xyz[0]} {xyz[1]} {xyz[2]}"/><axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>'
-            f'<limit lower="{lower}" upper="{upper}" effort="10" velocity="2"/></joint>'
+            f'<limit {"" if math.isinf(upper) else span} effort="10" velocity="2"/></joint>'
         )
         parent = f"{joint}_link"
     parts.append(
@@ -103,6 +105,19 @@ def right(arms: dict[str, Arm]) -> Arm:
 def six() -> RobotDescription:
     """Another robot, with six joints."""
     return RobotDescription.from_urdf(_serial("six", _SIX))
+
+
+@pytest.fixture(scope="session")
+def turning() -> dict[str, RobotDescription]:
+    """Robots whose first and last joints turn without end: one solved numerically, one in closed form."""
+    chains = {"six": _SIX, "straight": _SRS}
+    ends = {name: {chain[0][0], chain[-1][0]} for name, chain in chains.items()}
+    return {
+        name: RobotDescription.from_urdf(
+            _serial(name, [(*row[:3], -math.inf, math.inf) if row[0] in ends[name] else row for row in chain])
+        )
+        for name, chain in chains.items()
+    }
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import gc
+import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from openarm_motion.service.motion_service import MotionService, make_arms
 from openarm_motion.service.requests import (
     ArmGoal,
     ExecuteRequest,
+    JointGoal,
     LineGoal,
     MoveArmsRequest,
     MoveRequest,
@@ -88,6 +91,8 @@ class Robot:
         self.states, self.state = RobotStateBuffer(description), dict(home)
         self.t_ns = self.heard_ns = 10**9
         self.silent, self.stuck = False, set[str]()
+        #: Joints whose encoders know one turn.
+        self.wraps = set[str]()
         #: Until a controller accepts and begins; whether it then says when it began.
         self.latency_ns, self.tells = 0, True
         self.controllers = {arm: Controller(self, arm) for arm in ("left", "right")}
@@ -99,7 +104,8 @@ class Robot:
             controller.tick()
         if not self.silent:
             self.heard_ns = self.t_ns
-            self.states.add_joint_state(self.t_ns, list(self.state), list(self.state.values()))
+            read = {name: math.remainder(q, math.tau) if name in self.wraps else q for name, q in self.state.items()}
+            self.states.add_joint_state(self.t_ns, list(read), list(read.values()))
 
     def state_age(self) -> float:
         return (self.t_ns - self.heard_ns) * 1e-9
@@ -185,6 +191,40 @@ def test_a_move_is_planned_executed_and_its_arrival_verified(bench) -> None:
     np.testing.assert_allclose(
         [bench.robot.state[n] for n in bench.service.arms["right"].names], answer.trajectory.q[-1], atol=1e-9
     )
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_a_wrist_that_turns_without_end_goes_the_short_way_from_any_turn(description, home, table, wraps) -> None:
+    name = description.arm_joints("right")[6]
+    endless = replace(description.joint(name), type="continuous", lower=-math.inf, upper=math.inf)
+    robot = description._with_joints(endless)
+    arm = Arm("right", robot, MotionConfig(), [table])
+    bench = Bench({"right": arm}, robot, home)
+    bench.robot.wraps = {name} if wraps else set()
+
+    def goes(q7: float, *, given: float | None = None) -> float:
+        """Position of the wrist after a motion to `q7`; one that is given is of the turn `given`."""
+        start = bench.robot.state[name]
+        goal = np.array([*(home[joint] for joint in arm.names[:6]), q7])
+        request = MoveRequest("right", JointGoal(goal), scale=1.0, plan_only=given is not None)
+        (answer,) = bench.run(bench.service.move(request))
+        assert answer.code is Code.OK, answer.message
+        if given is not None:
+            motion = replace(answer.trajectory, q=answer.trajectory.q + given * math.tau * (np.arange(7) == 6))
+            (answer,) = bench.run(bench.service.execute(ExecuteRequest("right", motion)))
+            assert answer.code is Code.OK, answer.message
+        sent = bench.robot.controllers["right"].goals[-1].motion.q[:, 6]
+        assert sent[0] == pytest.approx(start, abs=1e-6)
+        assert np.abs(np.diff(sent)).max() < 0.2
+        return bench.robot.state[name]
+
+    ends = [goes(q7) for q7 in (3.1, -3.1, 13.0 - 2.0 * math.tau, 3.0, -1.0, 1.5)]
+    np.testing.assert_allclose(ends, np.unwrap([3.1, -3.1, 13.0 - 2.0 * math.tau, 3.0, -1.0, 1.5]), atol=1e-6)
+    assert goes(-2.0, given=3.0) == pytest.approx(math.tau - 2.0 + (ends[-1] - 1.5), abs=1e-6)
+    pose = arm.kinematics.fk([bench.robot.state[joint] for joint in arm.names])
+    solved = bench.service.compute_ik("right", pose, (), position_only=False).nearest
+    assert solved.success
+    assert abs(solved.q[6] - bench.robot.state[name]) < 0.1
 
 
 def test_plan_only_sends_nothing_and_the_plan_is_executed_later(bench) -> None:

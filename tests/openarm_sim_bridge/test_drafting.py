@@ -175,8 +175,12 @@ def test_shapes_are_where_the_geoms_are_and_meshes_of_one_file_are_one_file(fold
 @pytest.mark.parametrize(
     ("find", "replace", "words"),
     [
-        ('type="slide" axis="0 0 1" range="-0.1 0.2"', 'type="ball"', "'left_slide' is neither a hinge nor a slide"),
-        ('range="-0.1 0.2"', "", "'left_slide' slides without limits"),
+        (
+            'type="slide" axis="0 0 1" range="-0.1 0.2"',
+            'type="ball"',
+            "a slide; .*, write `fixed: .left_slide.` in edits",
+        ),
+        ('range="-0.1 0.2"', "", "'left_slide' slides without limits; write `range: {left_slide: .LOWER, UPPER.}` in"),
         ('name="left_hinge"', 'name="left_hinge" ref="0.1"', "'left_hinge' has ref 0.1, expected 0"),
         ('<joint name="left_g1"', '<joint axis="1 0 0"/><joint name="left_g1"', "body 'left_f1' has 2 joints"),
         ("0.02 -2 0", "0.02 -2 1", "no linear coupling"),
@@ -192,6 +196,24 @@ def test_what_a_urdf_cannot_have_is_named(mjcf, find, replace, words):
     mjcf.write_text(text.replace(find, replace, 1))
     with refuses(Code.CONFIG_INVALID, words):
         UrdfDraft("two", compiled(mjcf), Edits.model_validate(EDITS))
+
+
+def test_edits_fix_what_floats_and_limit_what_has_no_end(mjcf):
+    text = mjcf.read_text().replace(' range="-0.1 0.2"', "").replace(' range="-1.5 1.2"', "")
+    cart = '<body name="cart"><freejoint name="drive"/><geom type="sphere" size="0.1"/>'
+    for find, put in (('<body name="left_1"', cart), ('<body name="right_1"', "</body>")):
+        text = text.replace(find, put + find)
+    mjcf.write_text(text)
+    model = compiled(mjcf)
+    with refuses(Code.CONFIG_INVALID, "joint 'drive' is neither .* write `fixed: .drive.` in edits"):
+        UrdfDraft("two", model, Edits.model_validate(EDITS))
+    more = {"fixed": ["drive"], "range": {"*_slide": [-0.2, 0.1], "left_hinge": [-9.0, 9.0]}}
+    text = UrdfDraft("two", model, Edits.model_validate(EDITS | more)).text()
+    joints = RobotDescription.from_urdf(text).joints
+    assert joints["cart_fixed"].type == "fixed"
+    assert (joints["left_slide"].lower, joints["left_slide"].upper) == (-0.2, 0.1)
+    assert (joints["left_hinge"].type, joints["left_hinge"].upper) == ("revolute", 9.0)
+    assert (joints["right_hinge"].type, joints["right_hinge"].upper) == ("continuous", np.inf)
 
 
 def test_a_draft_says_what_is_left_to_do(folder):

@@ -281,6 +281,24 @@ def test_limits_that_a_urdf_lacks_are_given_for_all_joints_at_once(tmp_path):
     assert error.code is Code.INVALID_ARGUMENT
 
 
+def test_a_joint_that_turns_without_end_stays_so_unless_edits_give_it_limits(tmp_path):
+    text = robot().replace('"revolute"', '"continuous"')
+    folder, draft = drafted(tmp_path / "1", text)
+    found = RobotDescription.from_files(folder / "mine.urdf")
+    assert (found.joints["shoulder"].type, found.joints["shoulder"].upper) == ("continuous", np.inf)
+    assert not import_urdf(found).compile().joint("shoulder").limited
+    (remark,) = draft.remarks
+    assert remark.startswith("arms.arm: joints that turn without end: shoulder; where a cable forbids that, write")
+    assert folder_faults(folder) == []
+    (tmp_path / "edits.yaml").write_text("range: {shoulder: [-6.5, 6.5]}\n")
+    folder, draft = drafted(tmp_path / "2", text, edits=tmp_path / "edits.yaml")
+    found = RobotDescription.from_files(folder / "mine.urdf")
+    assert (found.joints["shoulder"].type, found.joints["shoulder"].lower) == ("revolute", -6.5)
+    assert draft.remarks == ()
+    planar = text.replace('"continuous"', '"planar"')
+    refused("joint 'shoulder' has type 'planar'; .* write type=\"fixed\"", drafted, tmp_path / "3", planar)
+
+
 def hand(tmp_path: Path, more: str) -> tuple[dict[str, object], dict[str, object], tuple[str, ...]]:
     """What a draft says of the hand on the upper link: arm and gripper, and remarks."""
     folder, draft = drafted(tmp_path, robot(more=more))

@@ -53,12 +53,14 @@ def tick(world: World, controller: RobotController, n: int = 1) -> None:
         world.step(world.steps_per_tick)
 
 
-def controllers_of(world: World, config: TrajectoryConfig, gripper: GripperConfig) -> RobotController:
+def controllers_of(
+    world: World, config: TrajectoryConfig, gripper: GripperConfig, arm: JointGroup = ARM
+) -> RobotController:
     servos = ServoModel(np.array([200.0]), np.array([4.0]), np.zeros(1), np.zeros(1), np.zeros(1))
     carriers = {"right": Carrier(servos, config.carrier)}
     state, effort = world.read_joints(), {"right": 30.0}
     return RobotController(
-        {"right": ARM}, {"right": GRIPPER}, world.joint_names, state, effort, config, gripper, carriers
+        {"right": arm}, {"right": GRIPPER}, world.joint_names, state, effort, config, gripper, carriers
     )
 
 
@@ -116,6 +118,24 @@ def keeps_pace(simulation: Simulation, share: float, ms: float) -> None:
     figures = simulation.periods.figures()
     assert figures.n > 150
     assert figures.p50_ms == pytest.approx(10.0, abs=ms)
+
+
+def test_a_hinge_without_limits_turns_on_and_commands_of_any_turn_take_the_short_way() -> None:
+    world, _ = make_controller()
+    endless = JointGroup(("j1",), np.array([-np.inf]), np.array([np.inf]), np.array([5.0]))
+    controller = controllers_of(world, TrajectoryConfig(), GripperConfig(), endless)
+    follower, ends = controller.arms["right"], list[TrajectoryOutcome]()
+    for points, seconds, end in (([0.0, 13.0], 6.0, 13.0), ([13.0 - 4.0 * np.pi, 0.0], 1.0, 4.0 * np.pi)):
+        given = Trajectory(("j1",), np.array([0.0, seconds]), np.array([points]).T, np.zeros((2, 1)))
+        state = world.read_joints()
+        follower.start(follower.check(given), state.t_ns, state.position[:1], ends.append)
+        tick(world, controller, round(seconds * 100) + 150)
+        assert world.read_joints().position[0] == pytest.approx(end, abs=0.01)
+    assert [one.end for one in ends] == [End.SUCCEEDED] * 2
+    for _ in range(20):
+        controller.command(controller.check_command(["j1"], [3.3]))
+        tick(world, controller, 20)
+    assert world.read_joints().position[0] == pytest.approx(2.0 * np.pi + 3.3, abs=0.01)
 
 
 @pytest.mark.requirement("A-18", "A-19")

@@ -105,7 +105,7 @@ class DynamicsClient(MotionClient):
         home = {n: q for s in description.arm_names for n, q in description.group_state(f"{s}_arm", "home").items()}
         home |= {hand.joint: hand.closed for hand in description.hands.values()}
         collides = arm.scene(home, ()).collides
-        lower, upper = description.limits(arm.names)
+        lower, upper = description.limits(arm.names, np.pi)
         chosen = postures(lower, upper, load, lambda q: not collides(q), count, np.random.default_rng(0))
         for k, posture in enumerate(chosen, 1):
             on_posture(k, count)

@@ -79,7 +79,7 @@ class Converter:
         """
         with as_moveit(MoveItErrorCodes.INVALID_GOAL_CONSTRAINTS):
             return Region(
-                tuple(_interval(joint) for joint in message.joint_constraints),
+                tuple(self._interval(joint) for joint in message.joint_constraints),
                 tuple(self._position(part, arm) for part in message.position_constraints),
                 tuple(self._orientation(part, arm) for part in message.orientation_constraints),
             )
@@ -111,6 +111,12 @@ class Converter:
         """
         with as_moveit(MoveItErrorCodes.INVALID_LINK_NAME):
             return self._names.on_tool(arm, link)
+
+    def _interval(self, message: JointConstraint) -> JointInterval:
+        name, joint = message.joint_name, self._description.joints.get(message.joint_name)
+        upper = 0.0 if joint is None else joint.upper
+        tolerances, weight = (message.tolerance_above, message.tolerance_below), _weight(message.weight, name)
+        return JointInterval(name, message.position, *tolerances, weight, upper)
 
     def _position(self, message: PositionConstraint, arm: str) -> PositionRegion:
         T = self.on_tool(arm, message.link_name)
@@ -193,11 +199,6 @@ class Converter:
                 for shape, pose in zip(shapes, places, strict=True):
                     out.append(_solid(message.id, T @ pose_to_matrix(pose), shape))
             return T, tuple(out)
-
-
-def _interval(message: JointConstraint) -> JointInterval:
-    name, weight = message.joint_name, _weight(message.weight, message.joint_name)
-    return JointInterval(name, message.position, message.tolerance_above, message.tolerance_below, weight)
 
 
 def _weight(given: float, name: str) -> float:
