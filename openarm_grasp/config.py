@@ -32,7 +32,7 @@ class ApproachConfig(Config):
         default_factory=lambda: robot_hand().max_width,
         gt=0.0,
         le=0.2,
-        description="widest object side that is grasped, m",
+        description="widest object side that is grasped, m; a hand that was learned may admit less",
     )
     width_noise: float = Field(
         default=0.002, ge=0.0, le=0.005, description="error of a measured width allowed beyond it, m"
@@ -70,6 +70,11 @@ class HandConfig(Config):
     open_tolerance: float = Field(
         default=0.004, gt=0.0, le=0.01, description="a finger this near to where it is open is there, m"
     )
+    learn: bool = Field(
+        default=False,
+        description="whether hands of which nothing was learned are closed and opened before the first request; never"
+        " where somebody may reach between the fingers",
+    )
     lets_go: float = Field(
         default=0.010, gt=0.0, le=0.05, description="a gap wider than what was held by this holds nothing, m"
     )
@@ -89,7 +94,12 @@ class TimingConfig(Config):
 class HeldConfig(Config):
     """What counts as holding an object."""
 
-    closed_below: float = Field(default=0.003, gt=0.0, le=0.02, description="a gap up to this is an empty hand, m")
+    closed_below: float = Field(
+        default=0.003,
+        gt=0.0,
+        le=0.02,
+        description="a gap up to this, beyond that of a learned hand closed on nothing, is an empty hand, m",
+    )
     width_tolerance: float = Field(default=0.005, gt=0.0, le=0.02, description="gap against the object's width, m")
     max_speed: float = Field(default=0.001, gt=0.0, le=0.01, description="fingers slower than this rest, m/s")
     min_effort: float = Field(default=5.0, gt=0.0, le=50.0, description="least closing force of the finger, N")
@@ -316,6 +326,9 @@ class GraspConfig(Config):
     """Parameters of the grasp node."""
 
     scene: str = Field(default="demo", description="scene file whose table the objects stand on")
+    calibrations: str = Field(
+        default="", description="folder of calibrations, which holds learned hands; empty: the default one"
+    )
     gripper_action: GripperAction = Field(
         default="parallel", description="type of the action `gripper`, as the bridge or the driver serves it"
     )

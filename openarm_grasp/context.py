@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from openarm_common.camera.cameras import CameraConfig, hand_cameras, load_cameras
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import per_robot
-from openarm_common.robot.hand import HandParts
+from openarm_common.robot.hand import Hand, HandParts, HandReach
 from openarm_common.robot.work import Table
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.arms import Shoulders, arm_order
@@ -27,6 +27,7 @@ class GraspContext:
         shoulders: (x, y) of each arm's shoulder, base frame, m.
         looks: Camera of the second look, by the arm whose hand carries it.
         cameras: At their mounts: the hand carries their housings.
+        hands: By arm; none: `hand` is that of each.
     """
 
     config: GraspConfig
@@ -35,6 +36,7 @@ class GraspContext:
     shoulders: Shoulders
     looks: Mapping[str, str] = field(default_factory=dict[str, str])
     cameras: tuple[CameraConfig, ...] = ()
+    hands: Mapping[str, Hand] = field(default_factory=dict[str, Hand])
 
     @classmethod
     def of(
@@ -54,11 +56,21 @@ class GraspContext:
             {arm: _shoulder(robot, arm) for arm in robot.arm_names},
             looks,
             tuple(cameras.values()),
+            robot.hands,
         )
+
+    def config_of(self, arm: str) -> GraspConfig:
+        """Return the parameters with the width that the hand of an arm, as far as it opens, has room around."""
+        config, hand = self.config, self.hands.get(arm)
+        if hand is None or hand.parts.max_width >= config.approach.max_width:
+            return config
+        approach = config.approach.model_copy(update={"max_width": hand.parts.max_width})
+        return config.model_copy(update={"approach": approach})
 
     def shape(self, arm: str) -> HandShape:
         """Return the shape of an arm's open hand, with the cameras that it carries; made the first time."""
-        return _shape(arm, self.cameras)
+        hand = self.hands.get(arm)
+        return _shape(arm, self.cameras, None if hand is None else hand.reach)
 
     def arm_order(self, arm: str, y: float) -> tuple[str, ...]:
         """Arms to try for an object; see `openarm_grasp.planning.arms.arm_order`."""
@@ -71,8 +83,9 @@ class GraspContext:
 
 
 @per_robot
-def _shape(arm: str, cameras: tuple[CameraConfig, ...]) -> HandShape:
-    return HandShape.of(RobotDescription.load(), arm, cameras)
+def _shape(arm: str, cameras: tuple[CameraConfig, ...], reach: HandReach | None) -> HandShape:
+    robot = RobotDescription.load().described
+    return HandShape.of(robot if reach is None else robot.with_hands({arm: reach}), arm, cameras)
 
 
 def _shoulder(robot: RobotDescription, arm: str) -> tuple[float, float]:

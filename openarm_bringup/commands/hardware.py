@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm hardware`: motors of a real arm on their buses, without a graph."""
+"""`openarm hardware`: motors of a real arm on their buses, without a graph; and hands, by the running one."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
+from openarm_bringup.commands.connect import Domain, check_arms, join_graph, requires_node
 from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import write_whole
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 Emulated = Annotated[bool, Parameter(negative=())]
 
-hardware = App(name="hardware", help="Motors of a real arm on their buses, without a graph.")
+hardware = App(name="hardware", help="Motors of a real arm on their buses, without a graph; hands, with one.")
 
 
 @hardware.command
@@ -144,6 +145,39 @@ def jog(joint: str, degrees: float, *, emulated: Emulated = False) -> Outcome:
         f" {math.degrees(found.others):.2f}°; {found.hottest} °C; {found.scheduling}"
     )
     return Outcome(True, message, data=vars(found), text="\n".join(found.turns))
+
+
+@hardware.command
+def learn_hand(
+    *, arm: str = "", yes: Annotated[bool, Parameter(negative=())] = False, domain: Domain = None
+) -> Outcome:
+    """Learn where the fingers of this hand stop: in the running graph, they close, open and close where the arm is.
+
+    Stored as calibrations are. Asks before it does it: nothing may be between the fingers, nor come there.
+
+    Args:
+        arm: Whose hand; those of all arms when not given.
+        yes: Do not ask.
+    """
+    join_graph(domain)
+    check_arms(arm)
+    from openarm_common.robot.description import RobotDescription
+    from openarm_grasp.ros.client import GraspClient
+
+    arms = tuple(RobotDescription.load().hands) if arm in ("", "auto") else (arm,)
+    if not yes:
+        shown = f"The fingers of {' and '.join(arms)} close, open and close: nothing may be between them."
+        console().print(shown, markup=False, highlight=False)
+        if not sys.stdin.isatty() or input("type learn to do it: ").strip() != "learn":
+            return Outcome(False, "nothing was moved; `--yes` does it without asking", Code.CANCELLED)
+    said: list[str] = []
+    with requires_node("grasp", "sim"), GraspClient() as client:
+        for name in arms:
+            answer = client.learn_hand(name)
+            said.append(answer.message)
+            if not answer.success:
+                return Outcome(False, "; ".join(said), answer.code)
+    return Outcome(True, f"{'; '.join(said)}. Grasps use it now; motion does from the next start of the graph on")
 
 
 @hardware.command

@@ -18,6 +18,7 @@ from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder
 from openarm_common.resources import config_dir, write_whole
+from openarm_common.robot.hand_store import HandStore
 from openarm_common.robot.zero_store import ZeroStore
 from openarm_common.robot.zeros import REAL, ZEROS, Zeros, keep_zeros
 
@@ -25,6 +26,8 @@ from openarm_common.robot.zeros import REAL, ZEROS, Zeros, keep_zeros
 _LARGEST_MIB = 4
 #: The node that simulates a robot.
 _BRIDGE = "mujoco_bridge"
+#: Its parameters that draw what is learned of a robot.
+_DRAWS = ("zero_seed", "zero_rms", "hand_seed")
 
 
 def domain_id(graph: Graph, environ: Mapping[str, str] = os.environ) -> int:
@@ -57,7 +60,7 @@ def client_environment(graph: Graph, run_dir: Path, environ: Mapping[str, str] =
     """Return the whole environment of a process that meets the graph; keeps the zeros of its robot in the run folder.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, when the stored zeros of the joints are damaged.
+        OpenArmError: CONFIG_INVALID, when the stored zeros of the joints, or the learned hands, are damaged.
     """
     env = {
         **environ,
@@ -83,15 +86,22 @@ def node_environment(graph: Graph, name: str, run_dir: Path, environ: Mapping[st
 
 
 def zeros_file(graph: Graph, run_dir: Path) -> Path:
-    """Return the file of the zeros of the joints in a run folder, copied from what is stored when a run begins."""
+    """Return the file of the zeros of the joints in a run folder, copied from what is stored when a run begins.
+
+    With the hands as they were learned.
+    """
     folder = run_dir / "zeros"
     if kept := sorted(folder.glob("*.yaml")):
         return kept[0]
-    publisher = graph.parameters("calibration_publisher") if "calibration_publisher" in graph.nodes else {}
-    given = str(publisher.get("store", ""))
-    store = ZeroStore(Path(given).expanduser() if given else default_folder())
-    record = store.in_use(zeros_name(graph)).record
-    return keep_zeros(Zeros(robot=record.robot, of=record.of, offsets=record.offsets), folder)
+    record = ZeroStore(_folder(graph, "calibration_publisher", "store")).in_use(zeros_name(graph)).record
+    hands = HandStore(_folder(graph, "grasp", "calibrations")).in_use(record.of)
+    return keep_zeros(Zeros(robot=record.robot, of=record.of, offsets=record.offsets, hands=dict(hands)), folder)
+
+
+def _folder(graph: Graph, node: str, parameter: str) -> Path:
+    """Return the folder of calibrations that a parameter of a node names; the default one without it."""
+    given = str(graph.parameters(node).get(parameter, "")) if node in graph.nodes else ""
+    return Path(given).expanduser() if given else default_folder()
 
 
 def zeros_name(graph: Graph) -> str:
@@ -104,7 +114,7 @@ def name_of_zeros(bridge: Mapping[str, object] | None) -> str:
     if bridge is None:
         return REAL
     profile = str(bridge.get("profile", "openarm"))
-    drawn = [f"{key}_{bridge[f'{profile}.{key}']}" for key in ("zero_seed", "zero_rms") if f"{profile}.{key}" in bridge]
+    drawn = [f"{key}_{bridge[f'{profile}.{key}']}" for key in _DRAWS if f"{profile}.{key}" in bridge]
     return re.sub("[^a-z0-9_]", "_", "_".join(["simulated", profile, *drawn]).lower())[:64]
 
 

@@ -22,7 +22,7 @@ from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import is_file
 from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, other_robot, robot_folder, robot_name
-from openarm_common.robot.hand import Hand
+from openarm_common.robot.hand import Hand, HandReach
 from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.meshes import take_meshes
 from openarm_common.robot.motors import JointMotion, Motors
@@ -81,7 +81,8 @@ class RobotDescription:
     def load(cls, name: str = "") -> RobotDescription:
         """Return a robot of `models/robots`; expanded once a process.
 
-        The robot of this process has the zeros of its joints as they were calibrated, where `OPENARM_ZEROS` names them.
+        The robot of this process has the zeros of its joints as they were calibrated, and its hands as they were
+        learned, where `OPENARM_ZEROS` names them.
 
         Args:
             name: Of its folder; "": that of this process.
@@ -217,6 +218,15 @@ class RobotDescription:
             zeros={**self.zeros, **{name: self.zeros.get(name, 0.0) + offset for name, offset in offsets.items()}},
             _described=self.described,
         )
+
+    def with_hands(self, hands: Mapping[str, HandReach]) -> RobotDescription:
+        """Return the robot with hands, by arm, as they were learned.
+
+        Raises:
+            OpenArmError: As `hand`.
+        """
+        learned = {arm: self.hand(arm).with_reach(reach) for arm, reach in hands.items()}
+        return replace(self, hands={**self.hands, **learned}, _described=self.described)
 
     @property
     def described(self) -> RobotDescription:
@@ -434,12 +444,12 @@ class RobotDescription:
 
 @lru_cache(maxsize=8)
 def _loaded(folder: Path, name: str, zeros: str) -> RobotDescription:
-    """Return a robot with the zeros of a file; the file of a run is written once."""
+    """Return a robot with the zeros and hands of a file; the file of a run is written once."""
     if zeros:
         held = read_zeros(Path(zeros))
         if text := other_robot(held.robot):
             raise OpenArmError(Code.CONFIG_INVALID, f"{zeros} {text}")
-        return _loaded(folder, name, "").with_zeros(held.offsets)
+        return _loaded(folder, name, "").with_zeros(held.offsets).with_hands(held.hands)
     return RobotDescription.from_folder(name)
 
 

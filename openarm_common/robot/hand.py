@@ -7,7 +7,7 @@ of the joint that drives the fingers, m of a slide or rad of a hinge, whose sign
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Self
 
@@ -67,6 +67,19 @@ class HandParts(Config):
         return float(np.interp(finger, *np.array(self.tcp).T))
 
 
+class HandReach(Config):
+    """What one hand reads at both ends of its fingers: no hand stops where its drawing does."""
+
+    closed: float = Field(ge=-0.05, le=0.05, description="finger of the hand closed on nothing, m")
+    opened: float = Field(gt=0.0, le=0.1, description="finger of the hand as far open as it gets, m")
+    effort: float = Field(default=0.0, ge=0.0, le=1e4, description="force of the fingers closed on nothing, N")
+    learned: str = Field(default="", max_length=40, description="when, as ISO 8601")
+
+    def __str__(self) -> str:
+        """Return the gaps of both ends, and when they were learned."""
+        return f"{self.closed * 2e3:.1f} to {self.opened * 2e3:.1f} mm, learned {self.learned or 'undated'}"
+
+
 @dataclass(frozen=True, eq=False)
 class Hand:
     """The fingers of one arm.
@@ -74,12 +87,18 @@ class Hand:
     Attributes:
         joint: That drives them.
         sign: Of its positions, against those of `parts`.
-        parts: Measures.
+        parts: Measures; the opening is that of the reach.
+        reach: As it was learned; None: the drawing stands for it.
     """
 
     joint: str
     sign: float
     parts: HandParts
+    reach: HandReach | None = None
+
+    def with_reach(self, reach: HandReach) -> Hand:
+        """Return the hand as it was learned."""
+        return replace(self, parts=self.parts.model_copy(update={"opening": reach.opened}), reach=reach)
 
     @cached_property
     def _table(self) -> Array:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The zeros of the joints that hold in a process: a file, which `OPENARM_ZEROS` names, also for processes it starts.
+"""The zeros of the joints, and the reach of the hands, that hold in a process: a file, which `OPENARM_ZEROS` names.
 
-Whoever starts a graph writes what is stored (see `zero_store`) into its run folder, so that all its nodes have the same
-zeros from their start to their end. rad.
+It holds for processes that this one starts, too. Whoever starts a graph writes what is stored (see `zero_store` and
+`hand_store`) into its run folder, so that all its nodes have the same zeros from their start to their end. rad.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pydantic import Field
 
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.resources import write_whole
+from openarm_common.robot.hand import HandReach
 
 ZEROS = "OPENARM_ZEROS"
 #: What the zeros of a real robot are stored as.
@@ -25,11 +26,12 @@ REAL = "zeros"
 
 
 class Zeros(Config):
-    """Zeros of the joints: where a joint is, minus what its encoder reports."""
+    """Zeros of the joints (where a joint is, minus what its encoder reports), and hands as they were learned."""
 
     robot: str = Field(description="name of the robot")
     of: str = Field(default=REAL, description="zeros: a real robot; else the simulated one that they are of")
     offsets: dict[str, float] = Field(description="by joint, rad")
+    hands: dict[str, HandReach] = Field(default_factory=dict[str, HandReach], description="by arm")
 
 
 def zeros_path() -> str:

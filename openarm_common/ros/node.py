@@ -180,6 +180,10 @@ class BaseNode(Node, Generic[ConfigT]):
             self.__description = RobotDescription.load()
         return self.__description
 
+    @description.setter
+    def description(self, robot: RobotDescription) -> None:
+        self.__description = robot
+
     def diagnose(self, ok: bool, message: str, **values: object) -> None:
         """Set what /diagnostics reports of this node once per second: OK or an error."""
         self.__report(DiagnosticStatus.OK if ok else DiagnosticStatus.ERROR, message, values)

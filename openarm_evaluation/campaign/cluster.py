@@ -133,7 +133,7 @@ def _connect(options: CampaignOptions) -> Any:
 
 def _prepare_robots(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> None:
     """Calibrate and identify here what is missing, once, instead of on every machine."""
-    turns = [len(draws) or 1 for draws in (options.mount_seeds, options.dynamics_seeds)]
+    turns = [len(draws) or 1 for draws in (options.mount_seeds, options.dynamics_seeds, options.hand_seeds)]
     first = {tuple(seed % turn for turn in turns): seed for seed in reversed(seeds)}
     for seed in first.values():
         with_robot(make_task(options.set_name, seed, options.objects), options, folder)

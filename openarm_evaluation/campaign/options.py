@@ -71,6 +71,8 @@ class CampaignOptions:
         hardware: simulated, or emulated: openarm_hardware before motors that take frames, through the graph alone.
         dynamics_seeds: Motors, masses and joint zeros to go through with the profile openarm, such as 1-10.
         controllers: Of the robot: suite, or openarm_ros2 with the profile openarm, through the graph alone.
+        hand_seeds: Stops and friction of the fingers to go through, such as 1-10; each hand is learned first. Those of
+            the drawing when not given.
         identify: Whether the servos of each draw are identified first.
         use_effort: Whether the force of the fingers counts as evidence.
         objects: Of the suites objects and heap: a folder of object folders, or superquadrics:N; those of models/objects
@@ -90,6 +92,7 @@ class CampaignOptions:
     controllers: FaceName = "suite"
     hardware: Literal["simulated", "emulated"] = "simulated"
     dynamics_seeds: Seeds = (1,)
+    hand_seeds: Seeds = ()
     identify: Annotated[bool, Parameter(negative="--no-identify")] = True
     use_effort: Annotated[bool, Parameter(name="--effort", negative="--no-effort")] = True
     objects: str = ""
@@ -135,6 +138,7 @@ class CampaignOptions:
             "noise": self.noise,
             "mount_seeds": list(self.mount_seeds),
             **self._profile_settings(),
+            **({"hand_seeds": list(self.hand_seeds)} if self.hand_seeds else {}),
             "use_effort": self.use_effort,
             **({"objects": self.objects} if self.objects else {}),
             **({"detector": self.finder} if self.finder != "color" else {}),
@@ -169,6 +173,7 @@ class CampaignOptions:
         ]
         parts.append("--noise" if self.noise else "")
         parts.append("--mount-seeds " + ",".join(map(str, self.mount_seeds)) if self.mount_seeds else "")
+        parts.append("--hand-seeds " + ",".join(map(str, self.hand_seeds)) if self.hand_seeds else "")
         if self.profile == "ideal":
             parts.append("--profile ideal")
         else:

@@ -27,6 +27,7 @@ from openarm_common.errors import OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import per_robot
+from openarm_common.robot.hand import HandReach
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.robot.servos import ServoModel
@@ -121,6 +122,8 @@ class SimRobot:
         mount_seed: Of the true camera mounts; None mounts them where the configuration says.
         mounts: T_parent_link by camera as the suite believes; those left out are nominal.
         dynamics_seed: Of motors, masses and joint zeros; None: that of the configuration.
+        hand_seed: Of stops and friction of the fingers; None: that of the configuration.
+        hands: As they were learned, by arm; the drawing stands for those left out.
         servos: Of the arms as identified, by side; None: as the profile says.
         table: As the suite believes; None: as it is.
         seed: Of the noise.
@@ -135,17 +138,19 @@ class SimRobot:
         mount_seed: int | None = None,
         mounts: Mapping[str, Array] | None = None,
         dynamics_seed: int | None = None,
+        hand_seed: int | None = None,
+        hands: Mapping[str, HandReach] | None = None,
         servos: Mapping[str, ServoModel] | None = None,
         table: Table | None = None,
         seed: int = 0,
         posture: Mapping[str, float] | None = None,
     ) -> None:
         self.scene = scene
-        self.description = RobotDescription.load()
+        self.description = RobotDescription.load().with_hands(hands or {})
         self.cameras = load_cameras()
         self._latency_s, self._sets = senses.latency, senses.parameters()
         self.suite = suite = suite_config(self._sets)
-        hardware = suite.bridge.hardware.of_seed(dynamics_seed)
+        hardware = suite.bridge.hardware.of_seed(dynamics_seed, hand_seed)
         stage = Stage(self.description, self.cameras, mount_seed, suite.bridge.physics, hardware)
         stage.home |= posture or {}
         bridge = suite.bridge
@@ -176,7 +181,7 @@ class SimRobot:
         self.planning_s: list[float] = []
         self.map = SimulatedMap(self.description, suite.octomap, self.mounted)
         self._controllers = {arm: _ArmController(self, arm) for arm in self.simulated.controller.arms}
-        arms = arms_behind(self._sets, self.table, tuple(self.mounted.values()))
+        arms = arms_behind(self._sets, self.table, tuple(self.mounted.values()), tuple((hands or {}).items()))
         self.motion = MotionService(self, suite.motion, arms, self.map, (self.description.root,))
         self.motion.on_held = self._take_held
         self._note()
@@ -426,18 +431,28 @@ class _Goal:
 
 
 def arms_behind(
-    sets: tuple[str, ...], table: Table, cameras: tuple[CameraConfig, ...] | None = None
+    sets: tuple[str, ...],
+    table: Table,
+    cameras: tuple[CameraConfig, ...] | None = None,
+    hands: tuple[tuple[str, HandReach], ...] = (),
 ) -> Mapping[str, Arm]:
-    """Return the arms of the motion service behind a table, with cameras at their mounts; made once a process."""
+    """Return the arms of the motion service behind a table, with cameras at their mounts and hands as learned.
+
+    Made once a process.
+    """
     motion = suite_config(sets).motion.model_copy(update={"faults": FaultsConfig()})
-    return _arms(motion.model_dump_json(), table.model_dump_json(), cameras)
+    return _arms(motion.model_dump_json(), table.model_dump_json(), cameras, hands)
 
 
 @per_robot
-def _arms(config: str, table: str, cameras: tuple[CameraConfig, ...] | None) -> Mapping[str, Arm]:
+def _arms(
+    config: str, table: str, cameras: tuple[CameraConfig, ...] | None, hands: tuple[tuple[str, HandReach], ...]
+) -> Mapping[str, Arm]:
     fixed = (table_box(Table.model_validate_json(table)),)
     by_name = None if cameras is None else {camera.name: camera for camera in cameras}
-    return make_arms(MotionConfig.model_validate_json(config), RobotDescription.load(), fixed, by_name)
+    return make_arms(
+        MotionConfig.model_validate_json(config), RobotDescription.load().with_hands(dict(hands)), fixed, by_name
+    )
 
 
 @per_robot

@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.hand import HandReach
 from openarm_common.robot.servos import ServoModel
 from openarm_common.types import Array
 from openarm_evaluation.campaign import record
 from openarm_evaluation.campaign.dynamics import with_servos
+from openarm_evaluation.campaign.hands import with_hands
 from openarm_evaluation.campaign.in_process_robot import InProcessRobot
 from openarm_evaluation.campaign.mounts import with_mounts
 from openarm_evaluation.campaign.options import CampaignOptions, Row
@@ -57,6 +59,7 @@ class Trials:
         config: Parameters of the grasp.
         mounts: T_parent_link by camera as the suite believes.
         servos: Of the arms as identified, by side; None: as the profile says.
+        hands: As they were learned, by arm.
         folder: Gets what is kept of a failure.
         again: The command that runs this task again, for the report.
     """
@@ -68,6 +71,7 @@ class Trials:
         config: GraspConfig,
         mounts: Mapping[str, Array] | None = None,
         servos: Mapping[str, ServoModel] | None = None,
+        hands: Mapping[str, HandReach] | None = None,
         folder: Path | None = None,
         again: str = "",
     ) -> None:
@@ -81,6 +85,8 @@ class Trials:
             mount_seed=task.mount_seed,
             mounts=mounts,
             dynamics_seed=task.dynamics_seed,
+            hand_seed=task.hand_seed,
+            hands=hands,
             servos=servos,
             seed=task.seed,
             posture=task.posture,
@@ -260,13 +266,13 @@ class Trials:
 
 def with_robot(
     task: Task, options: CampaignOptions, folder: Path
-) -> tuple[Task, Mapping[str, Array], Mapping[str, ServoModel] | None]:
-    """The task with the robot of its seed: mounts by camera and servos by side, as calibrated and identified by it.
+) -> tuple[Task, Mapping[str, Array], Mapping[str, ServoModel] | None, Mapping[str, HandReach]]:
+    """The task with the robot of its seed: mounts by camera, servos and hands by side, as the suite has found them.
 
     Args:
         task: The task.
         options: Of the campaign.
-        folder: Of the campaign; what it lacks of calibrations and identifications is made.
+        folder: Of the campaign; what it lacks of calibrations, identifications and learned hands is made.
     """
     mounts: Mapping[str, Array] = {}
     servos: Mapping[str, ServoModel] | None = None
@@ -275,20 +281,22 @@ def with_robot(
     if options.mount_seeds:
         hardware = suite_config(options.graph_parameters()).bridge.hardware.of_seed(task.dynamics_seed)
         task, mounts = with_mounts(task, options.mount_seeds, folder / "mounts", hardware)
-    return task, mounts, servos
+    task, hands = with_hands(task, options, folder)
+    return task, mounts, servos, hands
 
 
 def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
     """Run one task in this process and return its row, whatever happens."""
     task, sets = make_task(options.set_name, seed, options.objects), options.graph_parameters()
     try:
-        task, mounts, servos = with_robot(task, options, folder)
+        task, mounts, servos, hands = with_robot(task, options, folder)
         trials = Trials(
             task,
             SimulatedSenses(sets=sets),
             suite_config(sets).grasp,
             mounts=mounts,
             servos=servos,
+            hands=hands,
             folder=folder / "failures" / str(seed),
             again=options.command(seed),
         )

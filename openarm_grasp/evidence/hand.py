@@ -73,7 +73,9 @@ class HandReader:
         error = 0.0
         if T_base_planned is not None:
             error = float(np.linalg.norm(self.T_base_tcp()[:3, 3] - T_base_planned[:3, 3]))
-        return Evidence(self.gap(), expected, effort / abs(self.hand.lever), self.gap_speed(), error, pads)
+        return Evidence(
+            self.gap(), expected, effort / abs(self.hand.lever), self.gap_speed(), error, pads, self.hand.reach
+        )
 
     def _finger_in(self, q: Mapping[str, float]) -> float:
         if self.joint not in q:

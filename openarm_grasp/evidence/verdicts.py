@@ -14,6 +14,7 @@ import numpy as np
 
 from openarm_common.detection import Detection
 from openarm_common.errors import Code
+from openarm_common.robot.hand import HandReach
 from openarm_common.types import Array
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.perception.detections import Frame, apart, sticks_out
@@ -28,6 +29,8 @@ FOOTPRINT_WITHIN = 0.010
 _ELSEWHERE = 0.10
 #: Edges of a footprint that differ by less are taken for equal, m; those of what is round are, too.
 SQUARE_WITHIN = 0.006
+#: Fingers that go farther than was learned, by a gap of more than this, are others, m.
+_OUTDATED = 0.0015
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,7 @@ class Evidence:
         speed: Of the gap, m/s, any sign.
         tcp_error: Distance of the TCP from the planned grasp, m.
         pads: Force on each finger pad, N; empty without a sensor.
+        reach: Of this hand, where it was learned.
     """
 
     gap: float
@@ -49,6 +53,14 @@ class Evidence:
     speed: float
     tcp_error: float = 0.0
     pads: tuple[float, ...] = ()
+    reach: HandReach | None = None
+
+    def empty(self, config: HeldConfig) -> bool:
+        """Whether this is what the hand reads closed on nothing: its gap and, where they were learned, its force."""
+        if self.reach is None:
+            return self.gap <= config.closed_below
+        firmer = config.use_effort and abs(self.effort) > self.reach.effort + config.min_effort
+        return self.gap <= 2.0 * self.reach.closed + config.closed_below and not firmer
 
 
 @dataclass(frozen=True)
@@ -102,8 +114,8 @@ def judge_grip(
         return GripperVerdict(
             Code.HAND_COLLISION, f"the hand is {off:.1f} mm from the grasp, expected at most {limit:.0f} mm"
         )
-    if e.gap <= config.closed_below:
-        return GripperVerdict(empty, f"{gap}: the fingers are closed on nothing")
+    if e.empty(config):
+        return GripperVerdict(empty, f"{gap}: the fingers are closed on nothing{outdated(e.gap, e.reach)}")
     if closed is not None:
         if abs(e.gap - closed) > config.slip:
             was, limit = f"{closed * 1e3:.1f} mm when the hand had closed", f"at most {config.slip * 1e3:.0f} mm"
@@ -126,6 +138,18 @@ def judge_grip(
         )
     force = f", {abs(e.effort):.0f} N" if config.use_effort else ""
     return GripperVerdict(Code.OK, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held")
+
+
+def outdated(gap: float, reach: HandReach | None) -> str:
+    """Return what is said of a hand whose fingers go beyond what was learned of it; "" of any other."""
+    if reach is None or 2.0 * reach.closed - _OUTDATED <= gap <= 2.0 * reach.opened + _OUTDATED:
+        return ""
+    return f"; this hand goes from {reach}: were its fingers exchanged? {learn_command()} learns it again"
+
+
+def learn_command(arm: str = "") -> str:
+    """Return what to type to learn a hand, for messages; "": those of all arms."""
+    return f"`openarm hardware learn-hand{f' --arm {arm}' if arm else ''}`"
 
 
 def judge_sight(

@@ -51,7 +51,7 @@ def offers(
 
 def asked(context: GraspContext, arm: str, sighting: Sighting, failed: Sequence[FailedGrasp] = ()) -> Sampling:
     """Return what a sampler is given; a surface where the points of the object are known. Arguments as `offers`."""
-    config, surface = context.config, None
+    config, surface = context.config_of(arm), None
     if sighting.clouds:
         surface = fuse(views_of(sighting.clouds, context.table.top_z), context.table.top_z, step=config.cloud.voxel)
     return Sampling(

@@ -157,10 +157,10 @@ class GraspSession:
         A hand that is as wide as when it closed on the object that it kept still holds it, even within the tolerance of
         a wide open one.
         """
-        aperture, held, kept = robot.aperture(arm), self.context.config.held, self.kept.get(arm)
-        if kept is not None and kept.closed is not None and abs(aperture - kept.closed) <= held.slip:
+        aperture, slip, kept = robot.aperture(arm), self.context.config.held.slip, self.kept.get(arm)
+        if kept is not None and kept.closed is not None and abs(aperture - kept.closed) <= slip:
             return True
-        return held.closed_below < aperture and not robot.is_open(arm)
+        return not robot.is_closed(arm) and not robot.is_open(arm)
 
     async def release(self, robot: Skills, arm: str) -> str:
         """Open a hand where it is, and forget what it held; return what was done, in a sentence.

@@ -20,7 +20,7 @@ from openarm_common.robot.lift import LIFT
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
-from openarm_grasp.evidence.verdicts import Evidence
+from openarm_grasp.evidence.verdicts import Evidence, learn_command
 from openarm_grasp.perception.detections import Sighting, in_base
 from openarm_grasp.planning.candidates import (
     UP,
@@ -250,7 +250,7 @@ class Skills:
 
         def still_held() -> None:
             now = self.aperture(arm)
-            if now <= held.closed_below:
+            if self.is_closed(arm):
                 raise OpenArmError(Code.GRASP_LOST, f"{what}: the hand closed to {now * 1e3:.1f} mm on the way")
             if abs(now - at_first) > held.slip:
                 raise OpenArmError(
@@ -379,6 +379,13 @@ class Skills:
         """What the planner carries in a hand, TCP frame; None when it knows of nothing there."""
         return self.robot.held_box(arm)
 
+    def is_closed(self, arm: str) -> bool:
+        """Whether a hand is closed on nothing; raises as `aperture`."""
+        reader = self._hands[arm]
+        hand = reader.hand
+        force = 0.0 if hand.reach is None else self.robot.effort(hand.joint) / abs(hand.lever)
+        return Evidence(reader.gap(), 0.0, force, 0.0, reach=hand.reach).empty(self._config.held)
+
     def is_open(self, arm: str) -> bool:
         """Whether a hand is as wide open as for a grasp; raises as `aperture`."""
         reader = self._hands[arm]
@@ -411,6 +418,8 @@ class Skills:
         if not there():
             text = f"{what}: the fingers stopped at {reader.finger() * 1e3:.1f} mm of {finger * 1e3:.0f} mm"
             if reader.gap() < held + self._config.hand.lets_go:
+                learned = "" if reader.hand.reach is None else f" ({reader.hand.reach})"
+                text += f"; if nothing is in their way, this hand opens no farther{learned}: {learn_command(arm)}"
                 raise OpenArmError(Code.EXECUTION_FAILED, text)
             robot.warn(f"{text}, between other things")
 

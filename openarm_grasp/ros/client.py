@@ -12,6 +12,7 @@ from typing import Any
 from openarm_interfaces.action import Pick, PickTwo
 from openarm_interfaces.msg import GraspStatus, PickRequest, PickResult
 from openarm_interfaces.srv import ConfirmPlan, ReleaseHand
+from std_srvs.srv import Trigger
 
 from openarm_common.errors import Answer, Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
@@ -24,8 +25,8 @@ from openarm_grasp.ros.messages import code_from_text, option_from_msg
 OnFeedback = Callable[[GraspStatus], None]
 OnPlan = Callable[[GraspStatus], bool]
 
-#: Longest wait for a hand to open, s.
-_RELEASE_S = 30.0
+#: Longest wait for a hand to open, and to be learned, s.
+_RELEASE_S, _LEARN_S = 30.0, 90.0
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,14 @@ class GraspClient(BackgroundNode):
     def release(self, arm: str = "") -> Answer:
         """Open a hand where it is, and forget what it held; "" is the one that holds something."""
         return _answer(self.call(ReleaseHand, "/grasp/release", ReleaseHand.Request(arm=arm), _RELEASE_S))
+
+    def learn_hand(self, arm: str) -> Answer:
+        """Learn where the fingers of a hand stop: it closes, opens and closes. Nothing may be between them."""
+        answer: Trigger.Response = self.call(Trigger, f"/grasp/learn_hand/{arm}", Trigger.Request(), _LEARN_S)
+        if answer.success:
+            return Answer(True, Code.OK, answer.message)
+        code, _, text = answer.message.partition(": ")
+        return Answer(False, code_from_text(code, Code.INTERNAL), text)
 
     def pick_two(
         self,

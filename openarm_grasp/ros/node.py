@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The grasp node.
 
-Services /grasp, /grasp/confirm and /grasp/release, actions /grasp/pick and /grasp/pick_two, topics /grasp/status and
-/grasp/markers.
+Services /grasp, /grasp/confirm, /grasp/release and /grasp/learn_hand/ARM, actions /grasp/pick and /grasp/pick_two,
+topics /grasp/status and /grasp/markers.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 from openarm_interfaces.action import Pick, PickTwo
@@ -18,10 +19,14 @@ from openarm_interfaces.srv import ConfirmPlan, Grasp, ReleaseHand
 from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import QoSProfile
+from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.records import default_folder
+from openarm_common.robot.hand_store import HandStore
+from openarm_common.robot.zeros import keep_zeros, read_zeros, zeros_of, zeros_path
 from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
@@ -31,6 +36,7 @@ from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutco
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import GraspSession, Status, Task
 from openarm_grasp.robot.interface import RobotInterface
+from openarm_grasp.robot.learn import learn_hand
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.ros import messages
 from openarm_grasp.ros.flight_recorder_client import FlightRecorderClient
@@ -69,6 +75,8 @@ class GraspNode(BaseNode[GraspConfig]):
         self.create_service(Grasp, "/grasp", self._on_grasp)
         self.create_service(ConfirmPlan, "/grasp/confirm", self._on_confirm)
         self.create_service(ReleaseHand, "/grasp/release", self._on_release)
+        for arm in self.description.hands:
+            self.create_service(Trigger, f"/grasp/learn_hand/{arm}", partial(self._on_learn, arm))
         self._actions = [
             self._serve(Pick, "/grasp/pick", self._on_pick),
             self._serve(PickTwo, "/grasp/pick_two", self._on_pick_two),
@@ -115,6 +123,15 @@ class GraspNode(BaseNode[GraspConfig]):
         self.get_logger().info(f"release of the {request.arm or 'full'} hand: {response.message}")
         return response
 
+    async def _on_learn(self, arm: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.message = await self._take("the learning of a hand", lambda: self._learn(arm), moves=True)
+            response.success = True
+        except OpenArmError as error:
+            response.message = f"{error.code}: {error.message}"
+        self.get_logger().info(response.message)
+        return response
+
     async def _on_pick(self, goal: ServerGoalHandle) -> Pick.Result:
         def feedback(_: int, status: GraspStatus) -> None:
             goal.publish_feedback(Pick.Feedback(status=status))
@@ -154,15 +171,37 @@ class GraspNode(BaseNode[GraspConfig]):
     def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> ActionServer:
         return ActionServer(self, kind, name, execute, cancel_callback=self._on_cancel)
 
+    # --- hands
+    async def _learn(self, arm: str) -> str:
+        """Learn a hand, use it as it is from now on, and store it; return what was learned, in a sentence."""
+        reach = await learn_hand(self._skills, arm, self.config.timing.settle_limit)
+        folder = Path(self.config.calibrations).expanduser() if self.config.calibrations else default_folder()
+        path = HandStore(folder).keep(zeros_of(), arm, reach)
+        if run := zeros_path():  # of nodes of this run that start again
+            held = read_zeros(Path(run))
+            keep_zeros(held.model_copy(update={"hands": {**held.hands, arm: reach}}), Path(run).parent)
+        self.description = self.description.with_hands({arm: reach})
+        self._skills = Skills(self._robot, self.config)
+        self._session.context = replace(self._session.context, hands=self.description.hands)
+        return f"the {arm} hand goes from {reach}, and presses with {reach.effort:.0f} N closed on nothing; in {path}"
+
+    async def _learn_unknown(self, *requests: GraspRequest) -> None:
+        """Learn the hands of which nothing was learned, where that is allowed, before requests that may move them."""
+        if self.config.hand.learn and not any(one.dry_run or one.phase == "place" for one in requests):
+            for arm, hand in self.description.hands.items():
+                if hand.reach is None:
+                    self.get_logger().info(await self._learn(arm))
+
     # --- requests
     async def _one(self, request: GraspRequest, on_status: OnStatus | None = None) -> GraspOutcome:
         report = partial(self._publish, on_status=on_status)
+
+        async def work() -> GraspOutcome:
+            await self._learn_unknown(request)
+            return await carry_out(Task(self._session, self._skills, request, report))
+
         try:
-            outcome = await self._take(
-                _grasp_of(request.cut()),
-                lambda: carry_out(Task(self._session, self._skills, request, report)),
-                moves=not request.dry_run,
-            )
+            outcome = await self._take(_grasp_of(request.cut()), work, moves=not request.dry_run)
         except OpenArmError as error:
             request = request.cut()
             self._refused(f"grasp of {request.label!r}", error)
@@ -174,12 +213,14 @@ class GraspNode(BaseNode[GraspConfig]):
     async def _two(self, requests: tuple[GraspRequest, GraspRequest], on_status: OnStatus) -> PairOutcome:
         report = partial(self._publish, on_status=on_status)
         robots: dict[str, RobotInterface] = {arm: self._robot.next_to_other() for arm in self.description.arm_names}
+
+        async def work() -> PairOutcome:
+            await self._learn_unknown(*requests)
+            return await carry_out_pair(Pair(self._session, self._skills, robots, requests, report, carry_out))
+
+        named = _grasp_of(*(request.cut() for request in requests))
         try:
-            outcome = await self._take(
-                _grasp_of(*(request.cut() for request in requests)),
-                lambda: carry_out_pair(Pair(self._session, self._skills, robots, requests, report, carry_out)),
-                moves=not requests[0].dry_run,
-            )
+            outcome = await self._take(named, work, moves=not requests[0].dry_run)
         except OpenArmError as error:
             requests = (requests[0].cut(), requests[1].cut())
             self._refused(f"grasp of {requests[0].label!r} and {requests[1].label!r}", error)

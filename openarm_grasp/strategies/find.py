@@ -199,12 +199,14 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
     arms = run.context.arm_order(request.arm, float(target.p_base[1]))
     arms = retries.arms_to_try(arms, run.failed)
     ways: dict[str, retries.Ways] = {}
+    widths = {arm: run.context.config_of(arm).approach.max_width for arm in arms}
     for arm in arms:
         try:
             ways[arm] = run.ways(arm, sighting)
         except OpenArmError as error:
-            if error.code is not Code.IN_COLLISION and not (error.code is Code.TOO_WIDE and crowded(sighting)):
-                raise  # it does not fit into a hand wherever it stands; what seems one thing in a crowd may be several
+            too_wide = error.code is Code.TOO_WIDE and (crowded(sighting) or widths[arm] < max(widths.values()))
+            if error.code is not Code.IN_COLLISION and not too_wide:
+                raise  # it fits into no hand wherever it stands; what seems one thing in a crowd may be several
             run.findings.refusals[arm] = Verdict(error.code, error.message)
     where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
     for (note, tier), short, run.arm in product(_tiers(ways), (False, True), ways):
@@ -216,7 +218,7 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
         if not offered:
             continue
         # also those far from the weight, whether they are needed or not
-        options = options_of(run.arm, (*ways[run.arm].fresh, *offered), target, run.config.approach)
+        options = options_of(run.arm, (*ways[run.arm].fresh, *offered), target, run.context.config_of(run.arm).approach)
         run.options |= {key: option for key, option in options.items() if key not in run.options}
         text = f"{why}; trying the {run.arm} arm" if why else f"{target.label!r} stands at {where}"
         text += f"; {len(offered)} ways to grasp it{note}"

@@ -14,11 +14,12 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.context import GraspContext
-from openarm_grasp.evidence.verdicts import Evidence
+from openarm_grasp.evidence.verdicts import Evidence, learn_command
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, object_in
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.task import Grasp, GraspSession, release_command
+from openarm_grasp.robot.learn import CLOSED
 from openarm_grasp.robot.skills import Skills
 
 
@@ -45,10 +46,18 @@ async def take_up(session: GraspSession, robot: Skills, *requests: GraspRequest)
         elif holds:
             unknown.append(
                 f"the {arm} hand presses with {abs(evidence.effort):.0f} N on something {evidence.gap * 1e3:.0f} mm"
-                f" wide, and nothing is known of it; {release_command(arm)}"
+                f" wide, and nothing is known of it; {release_command(arm)}{_or_empty(robot, arm, evidence)}"
             )
     if unknown:
         raise OpenArmError(Code.NOT_READY, "; ".join(unknown))
+
+
+def _or_empty(robot: Skills, arm: str, evidence: Evidence) -> str:
+    """What to type when a hand that is nearly closed is empty, and stops there."""
+    if evidence.gap > 2.0 * CLOSED * robot.description.described.hand(arm).parts.opening:
+        return ""
+    learned = "" if evidence.reach is None else f" (it went from {evidence.reach})"
+    return f"; if it is empty, it closes no farther{learned}: {learn_command(arm)}"
 
 
 def _fits(box: Box, gap: float, tolerance: float) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motors of the arms and how a robot differs from its description: gains, friction, latency, encoders, masses.
+"""The motors of a robot and how it differs from its description: gains, friction, latency, encoders, masses, hands.
 
 A profile says what is possible, `drawn` makes one robot of it by seeds. Arrays (n,) are in the order of `joints`: the
 arm joints of both sides. N m, rad, s.
@@ -20,6 +20,8 @@ from openarm_common.types import Array
 from openarm_control.servos import ServoConfig
 
 Share = Annotated[float, Field(ge=0.0, le=0.5)]
+#: Shares of the drawn opening at which fingers stop, closed and open, and friction of their drive, N: from and to.
+_CLOSED, _OPENED, _FRICTION = (0.0, 0.045), (0.82, 1.0), (0.0, 2.0)
 
 
 class HardwareConfig(ServoConfig):
@@ -37,10 +39,14 @@ class HardwareConfig(ServoConfig):
     )
     dynamics_seed: int = Field(default=1, ge=0, description="of friction, latency, gains and masses")
     zero_seed: int = Field(default=1, ge=0, description="of the joint zeros")
+    hand_seed: int = Field(
+        default=-1, ge=-1, description="of the stops and the friction of the fingers; -1: those of the drawing"
+    )
 
-    def of_seed(self, seed: int | None) -> Self:
-        """Return it with one seed of all draws; None is those of the configuration."""
-        return self if seed is None else self.model_copy(update={"dynamics_seed": seed, "zero_seed": seed})
+    def of_seed(self, seed: int | None, hand_seed: int | None = None) -> Self:
+        """Return it with one seed of all draws but those of the hands, and theirs; None: that of the configuration."""
+        update = {} if seed is None else {"dynamics_seed": seed, "zero_seed": seed}
+        return self.model_copy(update=update | ({} if hand_seed is None else {"hand_seed": hand_seed}))
 
 
 #: Stiff servos that carry the arms and know where they are.
@@ -78,6 +84,15 @@ class Encoders:
         return cls(*np.zeros((5, n)))
 
 
+@dataclass(frozen=True)
+class FingerStops:
+    """Where the fingers of a hand stop, m from its middle, and friction of their drive, N."""
+
+    closed: float
+    opened: float
+    friction: float
+
+
 @dataclass(frozen=True, eq=False)
 class Hardware:
     """One robot as it is; arrays by arm joint name."""
@@ -96,6 +111,8 @@ class Hardware:
     gravity_compensation: float
     tool_stiffness: float
     bus: BusRange | None
+    #: By arm; where there are none, the limits of the description.
+    fingers: Mapping[str, FingerStops]
 
     def encoders(self, description: RobotDescription, joint_names: tuple[str, ...]) -> Encoders:
         """Return what commands and states of joints go through; fingers are exact but for their latency."""
@@ -143,6 +160,11 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
     def named(values: Array) -> dict[str, float]:
         return dict(zip(joints, np.asarray(values, dtype=np.float64).tolist(), strict=True))
 
+    fingers = dict[str, FingerStops]()
+    hands = np.random.default_rng([config.hand_seed + 1, 903])
+    for arm, hand in description.hands.items() if config.hand_seed >= 0 else ():
+        closed, opened = (hand.parts.opening * hands.uniform(*share) for share in (_CLOSED, _OPENED))
+        fingers[arm] = FingerStops(closed, opened, hands.uniform(*_FRICTION))
     n = len(joints)
     stiffness, damping, gearbox = (either(config.gain_error, n) for _ in range(3))
     dry = config.friction or (0.0, 0.0)
@@ -162,4 +184,5 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
         gravity_compensation=config.gravity_compensation or 0.0,
         tool_stiffness=config.tool_stiffness,
         bus=description.motors.bus if config.quantized and description.motors else None,
+        fingers=fingers,
     )

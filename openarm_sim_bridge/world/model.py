@@ -28,7 +28,7 @@ from openarm_common.robot.xml_text import child, floats
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
 from openarm_sim_bridge.world.appearance import vary
-from openarm_sim_bridge.world.hardware import IDEAL, Hardware, drawn
+from openarm_sim_bridge.world.hardware import IDEAL, FingerStops, Hardware, drawn
 from openarm_sim_bridge.world.touch import add_hand_sensors
 from openarm_sim_bridge.world.world import compiled_model
 
@@ -158,7 +158,7 @@ def robot_spec(
     set_options(spec, physics)
     for side in description.arm_names:
         _actuate_arm(spec, description, side, hardware)
-        _actuate_gripper(spec, description, side, physics)
+        _actuate_gripper(spec, description, side, physics, hardware.fingers.get(side))
     if description.lift is not None:
         _actuate_lift(spec, description, description.lift)
     for body in spec.bodies:
@@ -294,7 +294,9 @@ def _mount_softly(hand: mujoco.MjsBody, stiffness: float) -> None:
         )
 
 
-def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: str, physics: PhysicsConfig) -> None:
+def _actuate_gripper(
+    spec: mujoco.MjSpec, description: RobotDescription, side: str, physics: PhysicsConfig, stops: FingerStops | None
+) -> None:
     hand = description.hand(side)
     leader, lever = hand.joint, abs(hand.lever)
     followers = [joint for joint in description.joints.values() if joint.mimic == leader]
@@ -302,6 +304,9 @@ def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: s
         joint = spec.joint(name)
         joint.armature = hand.parts.armature
         joint.actfrclimited = False
+    if stops is not None:  # followers have no stops of their own
+        spec.joint(leader).range = sorted(hand.position(finger) for finger in (stops.closed, stops.opened))
+        spec.joint(leader).frictionloss = stops.friction * lever
     for finger in description.arm(side).fingers:
         pad = spec.geom(f"{finger}_pad_collision")
         # Priority: the pad's values decide over those of what it touches.

@@ -54,9 +54,9 @@ class Stage:
         if described.lift is not None:
             self.home[described.lift.joint] = described.lift.home
         for side in described.arm_names:
-            self.home |= described.group_state(f"{side}_arm", "home") | {
-                described.finger_joint(side): described.hand(side).closed
-            }
+            hand, stops = described.hand(side), made.fingers.get(side)
+            closed = hand.closed if stops is None else hand.position(stops.closed)
+            self.home |= described.group_state(f"{side}_arm", "home") | {hand.joint: closed}
 
     @cached_property
     def servos(self) -> dict[str, ServoModel]:

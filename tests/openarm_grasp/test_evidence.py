@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code
+from openarm_common.robot.hand import HandReach
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import (
     Evidence,
@@ -61,6 +63,30 @@ def test_grip_truth_table(changes, code, reason):
     verdict = judge_grip(Evidence(**{**vars(GOOD), **changes}), HELD)
     assert verdict.code is code
     assert reason in verdict.reason
+
+
+@pytest.mark.parametrize(
+    ("gap", "effort", "empty", "reason"),
+    [
+        (0.0032, -6.4, True, "closed on nothing$"),
+        (0.0062, -11.0, True, "closed on nothing$"),
+        (0.0062, -12.0, False, "narrower"),  # firmer than closed on nothing: something thin is between the fingers
+        (0.0010, -30.0, False, "narrower"),
+        (
+            0.0010,
+            -6.0,
+            True,
+            "closed on nothing; this hand goes from 3.2 to 76.0 mm, learned undated: were its fingers",
+        ),
+        (0.0064, -6.4, False, "narrower"),
+    ],
+)
+@pytest.mark.requirement("A-71")
+def test_a_hand_that_was_learned_is_empty_where_it_reads_what_it_read_closed_on_nothing(gap, effort, empty, reason):
+    evidence = replace(GOOD, gap=gap, effort=effort, reach=HandReach(closed=0.0016, opened=0.038, effort=6.4))
+    assert evidence.empty(HELD) is empty
+    assert re.search(reason, judge_grip(evidence, HELD).reason)
+    assert replace(evidence, gap=min(gap, 0.0062)).empty(HeldConfig(use_effort=False))
 
 
 @pytest.mark.parametrize(("pads", "held"), [((12.0, 14.0), True), ((12.0, 0.4), False), ((), False)])

@@ -12,6 +12,7 @@ import pytest
 from openarm_common.detection import Detection
 from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.hand import HandReach
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Sighting
@@ -180,6 +181,33 @@ def test_a_session_that_begins_with_a_full_hand_says_so_and_never_claims_an_empt
         world.ask("red")
     assert not world.done(Grip)
     assert list(world.session.kept) == (["right"] if found == "blue" else [])
+
+
+STOPPED = HandReach(closed=0.0016, opened=0.038, effort=6.4, learned="2026-11-30T01:00:00+00:00")
+
+
+@pytest.mark.parametrize(
+    ("gap", "effort", "reach", "refusal"),
+    [
+        (0.0032, -6.4, None, "6 N on something 3 mm wide.*if it is empty.*`openarm hardware learn-hand --arm right`"),
+        (0.0032, -6.4, STOPPED, ""),  # what this hand reads closed on nothing
+        (0.0039, -6.4, STOPPED, ""),
+        (0.0060, -20.0, STOPPED, "20 N on something 6 mm wide"),  # but far firmer
+        (0.0100, -20.0, STOPPED, "something 10 mm wide"),
+        (0.0080, -16.0, STOPPED, r"if it is empty.*\(it went from 3.2 to 76.0 mm, learned 2026-11-30"),  # other fingers
+    ],
+)
+@pytest.mark.requirement("P-01")
+def test_a_closed_hand_is_compared_with_what_this_hand_reads_closed_on_nothing(gap, effort, reach, refusal) -> None:
+    world = World(standing("red", 0.26, -0.2))
+    world.gap, world.effort, world.reach = gap, effort, reach
+    world.aperture = lambda arm: gap if arm == "right" else 0.0
+    if refusal:
+        with refuses(Code.NOT_READY, refusal):
+            world.ask("red")
+        return
+    assert world.ask("red").code is not Code.NOT_READY
+    refused("no hand holds anything", lambda: world.session.release(world, "").send(None))
 
 
 def test_the_arm_of_a_release_is_the_one_that_holds_and_must_be_said_when_both_do(world) -> None:

@@ -57,6 +57,26 @@ def test_what_is_drawn_arrives_in_the_model(description: RobotDescription) -> No
     assert model.body_gravcomp.max() < 1e-6
 
 
+@pytest.mark.parametrize("name", ["openarm_v1", "openarm_v2", "panda", "ur5e"])
+def test_fingers_of_a_seed_stop_within_a_few_millimetres_of_the_drawing_and_start_closed(name: str) -> None:
+    robot = RobotDescription.load(name)
+    ends: list[tuple[float, float]] = []
+    for seed in range(20):
+        for arm, stops in drawn(HardwareConfig(hand_seed=seed), robot).fingers.items():
+            ends.append((stops.closed, stops.opened))
+            assert 0.0 <= stops.closed <= 0.045 * robot.hand(arm).parts.opening
+            assert 0.82 * robot.hand(arm).parts.opening <= stops.opened <= robot.hand(arm).parts.opening
+    assert len(set(ends)) == len(ends)
+    assert not drawn(HardwareConfig(), robot).fingers
+    config = HardwareConfig(hand_seed=3)
+    stops, model = drawn(config, robot).fingers, robot_spec(robot, PhysicsConfig(), drawn(config, robot)).compile()
+    stage = Stage(robot, {}, None, PhysicsConfig(), config)
+    for arm, hand in robot.hands.items():
+        positions = sorted(hand.position(finger) for finger in (stops[arm].closed, stops[arm].opened))
+        np.testing.assert_allclose(model.joint(hand.joint).range, positions, atol=1e-9)
+        assert hand.finger(stage.home[hand.joint]) == pytest.approx(stops[arm].closed)
+
+
 def test_a_seed_is_a_robot_and_another_seed_another(description: RobotDescription) -> None:
     one, again, other = (drawn(HardwareConfig().of_seed(seed), description) for seed in (4, 4, 5))
     assert (one.friction, one.zero, one.mass, one.latency_s) == (

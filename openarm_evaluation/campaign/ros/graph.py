@@ -53,13 +53,15 @@ def rows_of_graph(options: CampaignOptions, seeds: Sequence[int], folder: Path, 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for what only the campaign in one process can do; whatever ends the graph.
     """
-    several = len(options.mount_seeds) > 1 or (options.profile != "ideal" and len(options.dynamics_seeds) != 1)
+    several = max(len(options.mount_seeds), len(options.hand_seeds)) > 1 or (
+        options.profile != "ideal" and len(options.dynamics_seeds) != 1
+    )
     if options.set_name not in GRAPH_SETS or several or options.workers != 1:
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
-            f"a campaign through the graph runs the sets {', '.join(GRAPH_SETS)} with one worker and at most one mount"
-            f" seed and one dynamics seed; asked for {options.set_name!r}, {options.workers} workers, mount seeds"
-            f" {options.mount_seeds}, dynamics seeds {options.dynamics_seeds}",
+            f"a campaign through the graph runs the sets {', '.join(GRAPH_SETS)} with one worker and at most one"
+            f" seed of mounts, hands and dynamics; asked for {options.set_name!r}, {options.workers} workers, mount"
+            f" seeds {options.mount_seeds}, hand seeds {options.hand_seeds}, dynamics seeds {options.dynamics_seeds}",
         )
     if seeds:
         asyncio.run(_run(options, seeds, folder, keep))
@@ -70,7 +72,7 @@ async def _run(options: CampaignOptions, seeds: Sequence[int], folder: Path, kee
     if options.mount_seeds:
         overrides["mount_seed"] = options.mount_seeds[0]
     name = "real" if options.emulated else "sim" if options.controllers == "suite" else "openarm_ros2_sim"
-    sets = (*options.graph_parameters(), *_robot(options, folder))
+    sets = (*options.graph_parameters(), *_robot(options, folder), *_hands(options, folder))
     graph = load_graph(name, overrides=overrides, sets=sets, emulate=options.emulated)
     for name in ("logs", "params", "scenes"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -108,6 +110,14 @@ def _robot(options: CampaignOptions, folder: Path) -> tuple[str, ...]:
     elif options.controllers != "suite":
         carrying = (f"arm_control.calibrations={known}", f"arm_control.dynamics_seed={seed}")
     return (f"mujoco_bridge.openarm.dynamics_seed={seed}", f"mujoco_bridge.openarm.zero_seed={seed}", *carrying)
+
+
+def _hands(options: CampaignOptions, folder: Path) -> tuple[str, ...]:
+    """Return the parameters of the hands of the hand seed, which the grasp learns before the first request."""
+    if not options.hand_seeds:
+        return ()
+    drawn = f"mujoco_bridge.{options.profile}.hand_seed={options.hand_seeds[0]}"
+    return (drawn, "grasp.hand.learn=true", f"grasp.calibrations={(folder / 'hands').absolute()}")
 
 
 def bring_home(client: GraspClient) -> None:

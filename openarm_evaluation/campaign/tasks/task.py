@@ -52,6 +52,7 @@ class Task:
         codes: Allowed results; OK is placed. Without OK it is impossible and must be refused.
         mount_seed: Of the true camera mounts; None: nominal.
         dynamics_seed: Of motors, masses and joint zeros; None: that of the configuration.
+        hand_seed: Of stops and friction of the fingers; None: that of the configuration.
         place: (x, y) of the requested footprint centre, base frame, m; None: chosen by the suite.
         posture: Joints that start elsewhere than at home, rad by name.
         clear: Repeated labels are several objects: what was placed stays where it is.
@@ -71,6 +72,7 @@ class Task:
     codes: tuple[Code, ...] = (Code.OK,)
     mount_seed: int | None = None
     dynamics_seed: int | None = None
+    hand_seed: int | None = None
     place: tuple[float, float] | None = None
     posture: Mapping[str, float] = field(default_factory=dict[str, float])
     clear: bool = False

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hands of a campaign's robot: those of each draw are learned once, by the suite itself, in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from openarm_common.errors import Code
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.hand import HandReach
+from openarm_common.robot.hand_store import HandStore
+from openarm_common.scene.scene import load_scene
+from openarm_evaluation.campaign.in_process_robot import InProcessRobot
+from openarm_evaluation.campaign.options import CampaignOptions
+from openarm_evaluation.campaign.parameters import suite_config
+from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
+from openarm_evaluation.campaign.tasks.task import Task
+from openarm_grasp.robot.learn import learn_hand
+from openarm_grasp.robot.skills import Skills
+from openarm_sim_bridge.world.hardware import drawn
+
+
+def with_hands(task: Task, options: CampaignOptions, folder: Path) -> tuple[Task, Mapping[str, HandReach]]:
+    """The task with the hands of one of the seeds (each in turn), and what was learned of them, by arm.
+
+    What is too wide for one of the hands, by the truth, may be refused for that.
+
+    Args:
+        task: The task.
+        options: Of the campaign; without seeds of hands, they are as drawn, and nothing is learned.
+        folder: Of learned hands; those that it lacks are learned.
+    """
+    if not options.hand_seeds:
+        return task, {}
+    seed = options.hand_seeds[task.seed % len(options.hand_seeds)]
+    task, store, name = replace(task, hand_seed=seed), HandStore(folder), f"hand_seed_{seed}"
+    robot, sets = RobotDescription.load(), options.graph_parameters()
+    known = store.in_use(name)
+    if missing := [arm for arm in robot.hands if arm not in known]:
+        config = suite_config(sets).grasp
+        senses = SimulatedSenses(sets=sets)
+        link = InProcessRobot(SimRobot(load_scene("empty"), senses, dynamics_seed=1, hand_seed=seed), config)
+        for arm in missing:
+            store.keep(name, arm, link.run(learn_hand(Skills(link, config), arm, config.timing.settle_limit)))
+        known = store.in_use(name)
+    true = drawn(suite_config(sets).bridge.hardware.of_seed(None, seed), robot.described).fingers
+    room = min(robot.hand(arm).parts.model_copy(update={"opening": one.opened}).max_width for arm, one in true.items())
+    asked = [item for item in task.scene.objects if task.graspable or item.label in task.labels]
+    if any(min(item.size[:2]) > room for item in asked):
+        task = replace(task, codes=(*task.codes, Code.TOO_WIDE))
+    return task, known
