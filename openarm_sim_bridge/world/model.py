@@ -305,8 +305,10 @@ def _actuate_gripper(
         joint.armature = hand.parts.armature
         joint.actfrclimited = False
     if stops is not None:  # followers have no stops of their own
-        spec.joint(leader).range = sorted(hand.position(finger) for finger in (stops.closed, stops.opened))
-        spec.joint(leader).frictionloss = stops.friction * lever
+        joint = spec.joint(leader)
+        joint.range = sorted(hand.position(finger) for finger in (stops.closed, stops.opened))
+        joint.solref_limit, joint.solimp_limit = physics.contact_solref, physics.contact_solimp
+        joint.frictionloss = stops.friction * lever
     for finger in description.arm(side).fingers:
         pad = spec.geom(f"{finger}_pad_collision")
         # Priority: the pad's values decide over those of what it touches.
