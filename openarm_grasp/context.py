@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from openarm_common.camera.cameras import CameraConfig, hand_cameras, load_cameras
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import per_robot
-from openarm_common.robot.hand import Hand, HandParts, HandReach
+from openarm_common.robot.hand import Hand, HandParts
 from openarm_common.robot.work import Table
+from openarm_common.robot.zeros import HandReach
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.arms import Shoulders, arm_order
 from openarm_grasp.sampling.hand_shape import HandShape

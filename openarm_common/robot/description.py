@@ -22,7 +22,7 @@ from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import is_file
 from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, other_robot, robot_folder, robot_name
-from openarm_common.robot.hand import Hand, HandReach
+from openarm_common.robot.hand import Hand
 from openarm_common.robot.lift import LiftParts
 from openarm_common.robot.meshes import take_meshes
 from openarm_common.robot.motors import JointMotion, Motors
@@ -31,7 +31,7 @@ from openarm_common.robot.turns import nearest_turns
 from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf, rewritten
 from openarm_common.robot.xacro_files import description_text
 from openarm_common.robot.xml_text import fault, parse_root
-from openarm_common.robot.zeros import read_zeros, zeros_path
+from openarm_common.robot.zeros import HandReach, read_zeros, zeros_path
 from openarm_common.types import Array
 
 __all__ = ["Joint", "Link", "Primitive", "RobotDescription"]

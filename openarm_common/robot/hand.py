@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from openarm_common.config import Config
 from openarm_common.types import Array
+
+if TYPE_CHECKING:
+    from openarm_common.robot.zeros import HandReach
 
 #: Room that an open finger keeps to each side of what it goes around, m: the error of a pose.
 _ROOM = 0.005
@@ -65,19 +68,6 @@ class HandParts(Config):
     def tcp_shift(self, finger: float) -> float:
         """How far beyond the TCP link fingers meet an object, along its z, m."""
         return float(np.interp(finger, *np.array(self.tcp).T))
-
-
-class HandReach(Config):
-    """What one hand reads at both ends of its fingers: no hand stops where its drawing does."""
-
-    closed: float = Field(ge=-0.05, le=0.05, description="finger of the hand closed on nothing, m")
-    opened: float = Field(gt=0.0, le=0.1, description="finger of the hand as far open as it gets, m")
-    effort: float = Field(default=0.0, ge=0.0, le=1e4, description="force of the fingers closed on nothing, N")
-    learned: str = Field(default="", max_length=40, description="when, as ISO 8601")
-
-    def __str__(self) -> str:
-        """Return the gaps of both ends, and when they were learned."""
-        return f"{self.closed * 2e3:.1f} to {self.opened * 2e3:.1f} mm, learned {self.learned or 'undated'}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,7 @@ from pydantic import Field
 
 from openarm_common.errors import OpenArmError
 from openarm_common.records import OfAnotherRobot, Record, RecordStore
-from openarm_common.robot.hand import HandReach
-from openarm_common.robot.zeros import REAL
+from openarm_common.robot.zeros import REAL, HandReach
 
 
 class StoredHands(Record):

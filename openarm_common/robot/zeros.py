@@ -18,11 +18,23 @@ from pydantic import Field
 
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.resources import write_whole
-from openarm_common.robot.hand import HandReach
 
 ZEROS = "OPENARM_ZEROS"
 #: What the zeros of a real robot are stored as.
 REAL = "zeros"
+
+
+class HandReach(Config):
+    """What one hand reads at both ends of its fingers: no hand stops where its drawing does."""
+
+    closed: float = Field(ge=-0.05, le=0.05, description="finger of the hand closed on nothing, m")
+    opened: float = Field(gt=0.0, le=0.1, description="finger of the hand as far open as it gets, m")
+    effort: float = Field(default=0.0, ge=0.0, le=1e4, description="force of the fingers closed on nothing, N")
+    learned: str = Field(default="", max_length=40, description="when, as ISO 8601")
+
+    def __str__(self) -> str:
+        """Return the gaps of both ends, and when they were learned."""
+        return f"{self.closed * 2e3:.1f} to {self.opened * 2e3:.1f} mm, learned {self.learned or 'undated'}"
 
 
 class Zeros(Config):

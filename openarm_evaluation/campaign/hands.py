@@ -9,8 +9,8 @@ from pathlib import Path
 
 from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.hand import HandReach
 from openarm_common.robot.hand_store import HandStore
+from openarm_common.robot.zeros import HandReach
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.campaign.in_process_robot import InProcessRobot
 from openarm_evaluation.campaign.options import CampaignOptions

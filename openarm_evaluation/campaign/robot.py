@@ -27,11 +27,11 @@ from openarm_common.errors import OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import per_robot
-from openarm_common.robot.hand import HandReach
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.robot.servos import ServoModel
 from openarm_common.robot.work import Table
+from openarm_common.robot.zeros import HandReach
 from openarm_common.scene.scene import Scene
 from openarm_common.types import Array
 from openarm_control.arm import End, TrajectoryFollower, TrajectoryOutcome

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.hand import HandReach
 from openarm_common.robot.servos import ServoModel
+from openarm_common.robot.zeros import HandReach
 from openarm_common.types import Array
 from openarm_evaluation.campaign import record
 from openarm_evaluation.campaign.dynamics import with_servos

@@ -14,7 +14,7 @@ import numpy as np
 
 from openarm_common.detection import Detection
 from openarm_common.errors import Code
-from openarm_common.robot.hand import HandReach
+from openarm_common.robot.zeros import HandReach
 from openarm_common.types import Array
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.perception.detections import Frame, apart, sticks_out

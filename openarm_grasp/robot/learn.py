@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import now
-from openarm_common.robot.hand import HandReach
+from openarm_common.robot.zeros import HandReach
 from openarm_grasp.evidence.verdicts import Evidence, learn_command
 from openarm_grasp.robot.skills import Skills
 

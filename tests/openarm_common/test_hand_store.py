@@ -12,9 +12,8 @@ from openarm_bringup.supervision.environment import zeros_file
 from openarm_bringup.supervision.graph import load_graph
 from openarm_common.robot import folder
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.hand import HandReach
 from openarm_common.robot.hand_store import HandStore
-from openarm_common.robot.zeros import ZEROS
+from openarm_common.robot.zeros import ZEROS, HandReach
 from tests.refusals import refused
 
 #: Of a seller's protocol: closed on nothing at -0.038 rad of a motor that takes 1.0472 rad for 44 mm; opens to 86 %.

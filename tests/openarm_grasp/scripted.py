@@ -15,7 +15,7 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
-from openarm_common.robot.hand import HandReach
+from openarm_common.robot.zeros import HandReach
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.verdicts import Evidence
@@ -111,7 +111,7 @@ class World(Skills):
 
     Attributes:
         slips: Closes that get nothing.
-        reach: Of the hands, where they were learned.
+        learned: What was learned of the hands.
         carried, effort: What the planner carries by arm; force of the fingers that hold nothing known, N.
         scene, q: Version of the planning scene, joints.
         near_off: How far off the camera on the hand sees objects, m.
@@ -128,7 +128,7 @@ class World(Skills):
         self.held: str | None = None
         self.carried: dict[str, Box] = {}
         self.effort = 0.0
-        self.reach: HandReach | None = None
+        self.learned: HandReach | None = None
         self.faults: list[Fault] = []
         self.log: list[tuple[float, Call]] = []
         self.status: list[Status] = []
@@ -330,7 +330,7 @@ class World(Skills):
         return self.gap
 
     def is_closed(self, arm: str) -> bool:
-        return Evidence(self.aperture(arm), 0.0, self.effort, 0.0, reach=self.reach).empty(self._config.held)
+        return Evidence(self.aperture(arm), 0.0, self.effort, 0.0, reach=self.learned).empty(self._config.held)
 
     def is_open(self, arm: str) -> bool:
         return self.gap >= 2.0 * (HAND.opening - self._config.hand.open_tolerance)
@@ -352,7 +352,7 @@ class World(Skills):
         self.call(Measure(arm, expected, T_base_tcp is not None))
         error = self.tcp_error if T_base_tcp is not None else 0.0
         effort = self.effort if self.held is None else -30.0
-        return Evidence(self.gap, expected, effort, 0.0, error, reach=self.reach)
+        return Evidence(self.gap, expected, effort, 0.0, error, reach=self.learned)
 
     def held_box(self, arm: str) -> Box | None:
         return self.carried.get(arm)

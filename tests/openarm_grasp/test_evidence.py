@@ -12,7 +12,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code
-from openarm_common.robot.hand import HandReach
+from openarm_common.robot.zeros import HandReach
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import (
     Evidence,

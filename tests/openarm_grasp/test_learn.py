@@ -12,8 +12,8 @@ import pytest
 
 from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.hand import HandReach
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.robot.zeros import HandReach
 from openarm_common.scene.scene import load_scene
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext

@@ -12,7 +12,7 @@ import pytest
 from openarm_common.detection import Detection
 from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.hand import HandReach
+from openarm_common.robot.zeros import HandReach
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Sighting
@@ -200,7 +200,7 @@ STOPPED = HandReach(closed=0.0016, opened=0.038, effort=6.4, learned="2026-11-30
 @pytest.mark.requirement("P-01")
 def test_a_closed_hand_is_compared_with_what_this_hand_reads_closed_on_nothing(gap, effort, reach, refusal) -> None:
     world = World(standing("red", 0.26, -0.2))
-    world.gap, world.effort, world.reach = gap, effort, reach
+    world.gap, world.effort, world.learned = gap, effort, reach
     world.aperture = lambda arm: gap if arm == "right" else 0.0
     if refusal:
         with refuses(Code.NOT_READY, refusal):

@@ -57,6 +57,7 @@ class FakeGraph(Node):
         asked: The same of motions alone: arm, what, and how long it may rest first.
         during: Called at the start of a motion; may return a future that it waits for.
         slips: Closes that get nothing.
+        stops: Where fingers stop, closed and open, m.
         scene: Version of the planning scene.
         executed: Trajectories.
         goal_ids: Of motions.
@@ -73,7 +74,7 @@ class FakeGraph(Node):
         self.kinematics = {arm: ArmKinematics(self.robot, self.robot.tcp_link(arm)) for arm in ARMS}
         self.t_ns, self.step_ns = 5_000_000_000, STEP_NS
         self.silent = self.blind = False
-        self.slips, self.scene = 0, 1
+        self.slips, self.scene, self.stops = 0, 1, (0.0, OPEN)
         self.executed: list[JointTrajectory] = []
         self.unreachable = False
         self.during: Callable[[str], Future | None] = lambda what: None
@@ -134,8 +135,8 @@ class FakeGraph(Node):
             result.stalled, result.reached_goal = True, False
         else:
             self.slips = max(0, self.slips - 1)
-        self.q[joint] = position
-        self.efforts[joint] = -30.0 if arm in self.hands else 0.0
+        self.q[joint] = float(np.clip(position, *self.stops))
+        self.efforts[joint] = -30.0 if arm in self.hands else 4000.0 * (position - self.q[joint])
         goal.succeed()
         return result
 
@@ -272,10 +273,10 @@ class FakeGraph(Node):
 class Bench:
     """The node under test, the fakes, and what was heard."""
 
-    def __init__(self, ros, **fakes: bool) -> None:
+    def __init__(self, ros, *, learn: bool = False, **fakes: bool) -> None:
         self.ros = ros
         self.world: FakeGraph = ros.add(FakeGraph(**fakes))
-        self.node: GraspNode = ros.start(GraspNode, limits__ready_timeout=60.0)
+        self.node: GraspNode = ros.start(GraspNode, limits__ready_timeout=60.0, hand__learn=learn)
         probe = ros.node
         latched = QoSProfile(depth=20, reliability=QOS_LATCHED.reliability, durability=QOS_LATCHED.durability)
         self.status: list[GraspStatus] = ros.hear(GraspStatus, "/grasp/status", latched)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from rclpy.task import Future
@@ -11,6 +12,8 @@ from visualization_msgs.msg import MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.hand_store import HandStore
+from openarm_common.robot.zeros import ZEROS, Zeros, keep_zeros, read_zeros
 from openarm_common.ros import client
 from openarm_common.ros.node import QOS_LATCHED
 from openarm_grasp.ros.client import GraspClient, GraspResult
@@ -116,3 +119,55 @@ def test_a_node_that_starts_with_a_full_hand_names_what_it_holds_and_the_client_
     assert (released.success, released.message) == (True, "the right hand is open; it held 'mug'")
     assert bench.world.log == ["gripper 0.044"]
     assert (nothing.code, nothing.message) == (Code.NOT_READY, "no hand holds anything")
+
+
+@pytest.fixture
+def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> HandStore:
+    """Where hands are stored, and the file of a run that has begun without any."""
+    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path))
+    monkeypatch.setenv(ZEROS, str(keep_zeros(Zeros(robot="openarm_v1", of="bench", offsets={}), tmp_path / "run")))
+    return HandStore(tmp_path)
+
+
+def test_a_hand_is_learned_for_this_run_and_those_to_come_and_works_with_the_width_that_it_has(
+    ros, stored: HandStore, tmp_path: Path
+) -> None:
+    bench = Bench(ros)
+    bench.world.stops = (0.0016, 0.038)
+    shut, learned, picked = bench.program(
+        lambda grasp: [grasp.pick("red"), grasp.learn_hand("right"), grasp.pick("red", arm="right")]
+    )
+    assert (shut.code, "`openarm hardware learn-hand --arm right`" in shut.message) == (Code.EXECUTION_FAILED, True)
+    assert learned.success, learned.message
+    assert "the right hand goes from 3.2 to 76.0 mm" in learned.message
+    assert "presses with 6 N closed on nothing" in learned.message
+    assert picked.success, picked.message
+    assert bench.world.log[-1] == "move home"
+    assert [one for one in bench.world.log if one.startswith("gripper")][-3:] == [
+        "gripper 0.038",
+        "gripper 0",
+        "gripper 0.038",
+    ]
+    hands = stored.in_use("bench")
+    assert list(hands) == ["right"]
+    assert read_zeros(tmp_path / "run" / "bench.yaml").hands == hands
+
+
+def test_where_it_is_allowed_unknown_hands_are_learned_before_the_first_request_and_full_ones_refused(
+    ros, stored: HandStore
+) -> None:
+    bench = Bench(ros, learn=True)
+    finger = RobotDescription.load().finger_joint("left")
+    bench.world.stops = (0.02, 0.038)  # something is between the fingers of either hand
+    full = bench.program(lambda grasp: grasp.pick("red"))
+    assert (full.outcome, full.code) == ("REFUSED", Code.NOT_READY)
+    assert "the left hand closes to 40.0 mm, expected 0 to 8.8 mm of an empty one; take out" in full.message
+    assert not stored.names()
+    bench.world.stops, bench.world.q[finger] = (0.0016, 0.038), 0.0016
+    bench.world.log.clear()
+    first, second = bench.program(lambda grasp: [grasp.pick("red"), grasp.pick("blue")])
+    assert first.success, first.message
+    assert second.success, second.message
+    assert bench.world.log[:6] == ["gripper 0", "gripper 0.044", "gripper 0"] * 2
+    assert bench.world.log.count("gripper 0.044") == 2
+    assert sorted(stored.in_use("bench")) == ["left", "right"]
