@@ -164,9 +164,14 @@ def learn_hand(
     from openarm_common.robot.description import RobotDescription
     from openarm_grasp.ros.client import GraspClient
 
-    arms = tuple(RobotDescription.load().hands) if arm in ("", "auto") else (arm,)
+    robot = RobotDescription.load()
+    arms = robot.arm_names if arm in ("", "auto") else (arm,)
+    for name in arms:
+        robot.hand(name)  # raises, when it has none
     if not yes:
-        shown = f"The fingers of {' and '.join(arms)} close, open and close: nothing may be between them."
+        shown = (
+            f"The fingers close, open and close, of: {', '.join(arms)}. Nothing may be between them, nor come there."
+        )
         console().print(shown, markup=False, highlight=False)
         if not sys.stdin.isatty() or input("type learn to do it: ").strip() != "learn":
             return Outcome(False, "nothing was moved; `--yes` does it without asking", Code.CANCELLED)
