@@ -60,12 +60,16 @@ class GraspContext:
             robot.hands,
         )
 
+    def parts(self, arm: str) -> HandParts:
+        """Return the measures of the hand of an arm."""
+        return self.hands[arm].parts if arm in self.hands else self.hand
+
     def config_of(self, arm: str) -> GraspConfig:
         """Return the parameters with the width that the hand of an arm, as far as it opens, has room around."""
-        config, hand = self.config, self.hands.get(arm)
-        if hand is None or hand.parts.max_width >= config.approach.max_width:
+        config, width = self.config, self.parts(arm).max_width
+        if width >= config.approach.max_width:
             return config
-        approach = config.approach.model_copy(update={"max_width": hand.parts.max_width})
+        approach = config.approach.model_copy(update={"max_width": width})
         return config.model_copy(update={"approach": approach})
 
     def shape(self, arm: str) -> HandShape:

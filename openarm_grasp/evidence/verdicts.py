@@ -29,7 +29,7 @@ FOOTPRINT_WITHIN = 0.010
 _ELSEWHERE = 0.10
 #: Edges of a footprint that differ by less are taken for equal, m; those of what is round are, too.
 SQUARE_WITHIN = 0.006
-#: Fingers that go farther than was learned, by a gap of more than this, are others, m.
+#: Fingers that close farther than was learned, by a gap of more than this, are others, m.
 _OUTDATED = 0.0015
 
 
@@ -141,8 +141,8 @@ def judge_grip(
 
 
 def outdated(gap: float, reach: HandReach | None) -> str:
-    """Return what is said of a hand whose fingers go beyond what was learned of it; "" of any other."""
-    if reach is None or 2.0 * reach.closed - _OUTDATED <= gap <= 2.0 * reach.opened + _OUTDATED:
+    """Return what is said of a hand that closes farther than was learned of it; "" of any other."""
+    if reach is None or gap >= 2.0 * reach.closed - _OUTDATED:
         return ""
     return f"; this hand goes from {reach}: were its fingers exchanged? {learn_command()} learns it again"
 

@@ -57,7 +57,7 @@ def asked(context: GraspContext, arm: str, sighting: Sighting, failed: Sequence[
     return Sampling(
         sighting.target,
         config,
-        context.hand,
+        context.parts(arm),
         sighting.others,
         context.shoulders.get(arm, (0.0, 0.0)),
         surface,

@@ -214,7 +214,7 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
         if short:
             refused = run.findings.refusals.get(run.arm)
             far = refused is not None and refused.code is Code.UNREACHABLE and not run.findings.place_refused
-            offered = _farther(offered, run.context.hand) if far else ()
+            offered = _farther(offered, run.context.parts(run.arm)) if far else ()
         if not offered:
             continue
         # also those far from the weight, whether they are needed or not
