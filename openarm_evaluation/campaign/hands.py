@@ -17,6 +17,7 @@ from openarm_evaluation.campaign.options import CampaignOptions
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
+from openarm_grasp.context import GraspContext
 from openarm_grasp.robot.learn import learn_hand
 from openarm_grasp.robot.skills import Skills
 from openarm_sim_bridge.world.hardware import drawn
@@ -25,7 +26,7 @@ from openarm_sim_bridge.world.hardware import drawn
 def with_hands(task: Task, options: CampaignOptions, folder: Path) -> tuple[Task, Mapping[str, HandReach]]:
     """The task with the hands of one of the seeds (each in turn), and what was learned of them, by arm.
 
-    What is too wide for one of the hands, by the truth, may be refused for that.
+    What is too wide for the hands that may reach it, by the truth, may be refused for that.
 
     Args:
         task: The task.
@@ -36,18 +37,21 @@ def with_hands(task: Task, options: CampaignOptions, folder: Path) -> tuple[Task
         return task, {}
     seed = options.hand_seeds[task.seed % len(options.hand_seeds)]
     task, store, name = replace(task, hand_seed=seed), HandStore(folder), f"hand_seed_{seed}"
-    robot, sets = RobotDescription.load(), options.graph_parameters()
-    known = store.in_use(name)
+    robot, sets, known = RobotDescription.load(), options.graph_parameters(), store.in_use(name)
+    config = suite_config(sets)
     if missing := [arm for arm in robot.hands if arm not in known]:
-        config = suite_config(sets).grasp
         senses = SimulatedSenses(sets=sets)
-        link = InProcessRobot(SimRobot(load_scene("empty"), senses, dynamics_seed=1, hand_seed=seed), config)
+        link = InProcessRobot(SimRobot(load_scene("empty"), senses, dynamics_seed=1, hand_seed=seed), config.grasp)
         for arm in missing:
-            store.keep(name, arm, link.run(learn_hand(Skills(link, config), arm, config.timing.settle_limit)))
+            reach = link.run(learn_hand(Skills(link, config.grasp), arm, config.grasp.timing.settle_limit))
+            store.keep(name, arm, reach)
         known = store.in_use(name)
-    true = drawn(suite_config(sets).bridge.hardware.of_seed(None, seed), robot.described).fingers
-    room = min(robot.hand(arm).parts.model_copy(update={"opening": one.opened}).max_width for arm, one in true.items())
-    asked = [item for item in task.scene.objects if task.graspable or item.label in task.labels]
-    if any(min(item.size[:2]) > room for item in asked):
-        task = replace(task, codes=(*task.codes, Code.TOO_WIDE))
+    stops = drawn(config.bridge.hardware.of_seed(None, seed), robot.described).fingers
+    true = robot.with_hands({arm: HandReach(closed=one.closed, opened=one.opened) for arm, one in stops.items()})
+    context = GraspContext.of(config.grasp, task.scene.table, true)
+    for item in task.scene.objects:
+        arms = context.arm_order(task.arm, item.position[1])
+        asked = task.graspable or item.label in task.labels
+        if asked and min(item.size[:2]) > max(context.parts(arm).max_width for arm in arms):
+            return replace(task, codes=(*task.codes, Code.TOO_WIDE)), known
     return task, known
