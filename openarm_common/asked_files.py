@@ -5,23 +5,25 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from openarm_common.errors import Code, OpenArmError
 
 
-def file_to_read(text: str, suffixes: Sequence[str]) -> Path:
+def file_to_read(text: str, suffixes: Sequence[str], others: Mapping[str, str] = MappingProxyType({})) -> Path:
     """Return the path of a file that a request asks to read: a regular one, so that nothing waits for its end.
 
     Args:
         text: The path; ~ is the node's home, and a relative path begins at its working directory.
         suffixes: Those that it may have, such as .bt.
+        others: What to do with a file of another suffix.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for another suffix or kind of file.
     """
-    path = _path(text, suffixes)
+    path = _path(text, suffixes, others)
     try:
         kind = path.stat().st_mode
     except OSError as error:
@@ -56,7 +58,7 @@ def file_to_write(text: str, suffixes: Sequence[str]) -> Path:
     return path
 
 
-def _path(text: str, suffixes: Sequence[str]) -> Path:
+def _path(text: str, suffixes: Sequence[str], others: Mapping[str, str] = MappingProxyType({})) -> Path:
     wanted = f"a file that ends in {' or '.join(suffixes)}"
     if not text:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"path is empty; expected {wanted}")
@@ -65,7 +67,8 @@ def _path(text: str, suffixes: Sequence[str]) -> Path:
     except RuntimeError as error:  # there is no such user
         raise _refused(text, str(error), wanted) from error
     if not text.isprintable() or path.suffix not in suffixes:
-        raise _refused(text, "it has another suffix, or characters that are no text", wanted)
+        way = f"; {others[path.suffix]}" if path.suffix in others else ""
+        raise _refused(text, "it has another suffix, or characters that are no text", f"{wanted}{way}")
     return path
 
 

@@ -193,6 +193,7 @@ class Bag:
             by_topic[channel.topic].append(channel)
         self._channels: dict[str, list[Channel]] = {}
         self.left_out: dict[str, str] = {}
+        self._why_not: dict[str, str] = {}
         for topic, channels in by_topic.items():
             counts = Counter[str]()
             for channel in channels:
@@ -215,6 +216,11 @@ class Bag:
         Raises:
             OpenArmError: INVALID_ARGUMENT, when no installed package has the type.
         """
+        if topic not in self._why_not:
+            self._why_not[topic] = self._changed(topic)
+        return self._why_not[topic]
+
+    def _changed(self, topic: str) -> str:
         kind, _ = self.topics[topic]
         if not hasattr(interface(kind), "get_fields_and_field_types"):
             return f"{topic} was recorded as {kind}, which is no message"
@@ -297,4 +303,9 @@ def listed(reasons: Mapping[str, str]) -> str:
 
 def damaged(path: Path, error: Exception) -> OpenArmError:
     """Return the error of a bag whose content is not what its format says, in one sentence."""
-    return OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be read as a bag: {type(error).__name__}: {said(error)}")
+    text = f"{path} can't be read as a bag: {type(error).__name__}: {said(error)}"
+    # errors of ours say more; SQLite's way is in them
+    way = (
+        "" if ";" in text else "; copy it again, or save what is whole of an .mcap by `mcap recover FILE -o SAVED.mcap`"
+    )
+    return OpenArmError(Code.INVALID_ARGUMENT, text + way)

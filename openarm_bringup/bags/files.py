@@ -52,6 +52,10 @@ _OTHERS: Sequence[tuple[bytes, str]] = (
 )
 
 
+#: Names of archives, which may hold one: what they are is said.
+_ARCHIVES = {".gz", ".tgz", ".tar", ".zip", ".bz2", ".xz", ".7z", ".rar", ".lz4"}
+
+
 @dataclass(frozen=True)
 class Found:
     """Files of a recording in their order, and what metadata.yaml says was kept with it."""
@@ -62,7 +66,7 @@ class Found:
 
 def is_recording(path: Path) -> bool:
     """Whether a file is a recording by its name or its first bytes, of ROS 1 too, or a folder has such a file."""
-    named = _is_part(path.name) or path.suffix == ".bag"
+    named = _is_part(path.name) or path.suffix == ".bag" or path.suffix.lower() in _ARCHIVES
     if named or not os.access(path, os.R_OK):
         return named
     if path.is_dir():

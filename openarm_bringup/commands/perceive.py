@@ -138,7 +138,9 @@ def perceive(
     count = len(found.segmentation.clusters)
     first, last = found.depths
     message = f"{count} on a plane with {found.segmentation.support.share:.0%} of what was measured, {first:.2f} to"
-    message += f" {last:.2f} m away"
+    dense, thin = (value * 1e3 for value in found.spacing)
+    message += f" {last:.2f} m away, points {dense:.1f} to {thin:.1f} mm apart: things under {found.least * 1e3:.0f} mm"
+    message += " across are left out"
     if hint := found.unit_hint():
         message += f"; {hint}"
     if cloud is not None and cloud.note:
@@ -158,7 +160,7 @@ def _table(rows: list[tuple[str, ...]]) -> str:
     from rich.text import Text
 
     table = Table(box=None, pad_edge=False)
-    for name in ("#", "colour", "shape", "edges [mm]", "x y z [m]", "pixels"):
+    for name in ("#", "colour", "shape", "edges [mm]", "± [mm]", "x y z [m]", "pixels"):
         table.add_column(name, no_wrap=True)
     table.add_column("why it is no prism", no_wrap=True)
     for row in rows:

@@ -49,6 +49,18 @@ _FIRST_HEADER = struct.Struct("<idI")
 #: Leaves that are read at a time.
 _PART = 1 << 14
 _FIRST_LINE = {".bt": "# Octomap OcTree binary file", ".ot": "# Octomap OcTree file"}
+_FLAT = "a flat map, as of Nav2, has no heights; one with heights is saved by `openarm map save`"
+_CLOUD = (
+    "a cloud is inserted with pyoctomap: tree = OcTree(0.02); tree.insertPointCloud(points, origin); tree.writeBinary"
+)
+#: What other files are that maps are kept in, and what to do.
+OTHERS = {
+    ".gz": "unpack it: gunzip -c FILE > OTHER.bt",
+    ".zip": "unpack it: unzip FILE",
+    ".binvox": "convert it with a tool of OctoMap: binvox2bt FILE",
+    **dict.fromkeys((".pgm", ".png", ".yaml"), _FLAT),
+    **dict.fromkeys((".ply", ".pcd", ".xyz", ".las", ".npy", ".npz"), _CLOUD),
+}
 _NOTE = "# (feel free to add / change comments, but leave the first line as it is!)\n#"
 #: A comment, which liboctomap skips: the robot in whose base frame the map is.
 _ROBOT = "# robot "
@@ -328,7 +340,8 @@ def read_file(path: Path) -> Leaves:
     try:
         return _parse(content)
     except OpenArmError as error:
-        raise OpenArmError(error.code, f"{path}: {error.message}") from error
+        way = OTHERS.get(".gz" if content.startswith(b"\x1f\x8b") else path.suffix)
+        raise OpenArmError(error.code, f"{path}: {error.message}" + (f"; {way}" if way else "")) from error
 
 
 def _parse(content: bytes) -> Leaves:

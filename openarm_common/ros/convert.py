@@ -191,27 +191,41 @@ def cloud_from_fields(names: Sequence[str], data: Floats, frame_id: str, t_ns: i
     return message
 
 
+#: Datatypes of sensor_msgs/PointField.
+_FLOATS = {PointField.FLOAT32: np.float32, PointField.FLOAT64: np.float64}
+
+
 def points_from_cloud(message: PointCloud2) -> Floats:
-    """Read points (n, 3) or (height, width, 3) of a cloud whose first fields are float32 x, y, z.
+    """Read points (n, 3) or (height, width, 3) of a cloud: fields x, y, z of floats of 4 or 8 bytes, in either order.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for another layout.
     """
-    layout = [(brief_text(f.name), f.offset, f.datatype) for f in message.fields[:3]]
-    if layout != [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"cloud fields {layout} are not supported, expected float32 x, y, z first"
-        )
-    step, size = message.point_step, message.height * message.width
-    if step < 12 or step % 4 or message.row_step != step * message.width or len(message.data) != step * size:
+    found = {f.name: (f.offset, f.datatype) for f in message.fields}
+    (x, kind), (y, other), (z, last) = (found.get(axis, (0, 0)) for axis in "xyz")
+    if not kind == other == last or kind not in _FLOATS or y - x != z - y:
+        layout = {brief_text(name): where for name, where in list(found.items())[:6]}
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
-            f"cloud of {message.width}×{message.height} points has steps {step} and {message.row_step} and"
-            f" {len(message.data)} bytes, expected steps of 4-byte fields without gaps",
+            f"cloud has fields {layout} (name: offset, datatype); expected x, y, z of FLOAT32 (7) or FLOAT64 (8),"
+            " equally far apart",
         )
-    rows = np.frombuffer(message.data, dtype=np.float32).reshape(message.height, message.width, step // 4)
-    points = rows[..., :3]
-    return points[0] if message.height == 1 else points
+    kept = np.dtype(_FLOATS[kind]).newbyteorder(">" if message.is_bigendian else "<")
+    step, width, height = message.point_step, message.width, message.height
+    row = message.row_step if height > 1 else step * width
+    end = max(x, z) + kept.itemsize
+    size = row * max(height - 1, 0) + step * width
+    if end > step or row < step * width or len(message.data) < size:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"cloud of {width}×{height} points has steps {step} and {message.row_step} and {len(message.data)} bytes;"
+            f" expected steps of at least {end} and {step * width}, and {size} bytes",
+        )
+    shape, strides = (height, width, 3), (row, step, y - x)
+    buffer = np.frombuffer(message.data, np.uint8)
+    points = np.ndarray(shape, kept, buffer, x, strides) if height * width else np.empty(shape, np.float32)
+    points = np.require(points, np.float32, "A")
+    return points[0] if height == 1 else points
 
 
 # --- joint states

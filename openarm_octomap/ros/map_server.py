@@ -16,6 +16,7 @@ from std_srvs.srv import Empty
 
 from openarm_common.asked_files import file_to_read, file_to_write
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.octree.codec import OTHERS
 from openarm_common.octree.lattice import DEPTH
 from openarm_common.ros.answers import answering
 from openarm_common.ros.convert import ns_to_stamp, xyz
@@ -114,7 +115,7 @@ class MapServices:
         return f"{path}: {response.nodes} nodes"
 
     def _load(self, request: MapFile.Request, response: MapFile.Response) -> str:
-        path = file_to_read(request.path, SUFFIXES)
+        path = file_to_read(request.path, SUFFIXES, OTHERS)
         taken = self._mapper.load(path)
         response.nodes, response.outside = taken.nodes, taken.outside
         self._show()

@@ -81,8 +81,8 @@ def _objectness(table: Table, classes: int, threshold: float) -> Picked:
 
 
 def _rows(table: Table, classes: int, threshold: float) -> Picked:
-    """One score, then the number of the class."""
-    columns = np.nonzero(table[4] >= threshold)[0]
+    """One score, then the number of the class; rows of class -1 are none."""
+    columns = np.nonzero((table[4] >= threshold) & (table[5] != -1.0))[0]
     with np.errstate(invalid="ignore"):  # what is no number becomes one that no class has
         return columns, table[5, columns].astype(np.int64), table[4, columns]
 
@@ -126,7 +126,7 @@ def layout_of(output: NDArray[np.floating], classes: int, extra: int, size: tupl
 def _has_rows(output: NDArray[np.floating], classes: int) -> bool:
     """Whether the sixth channel holds numbers of classes; of one class, 1 is its score."""
     kinds = output[:, 5]
-    whole = bool((kinds == np.round(kinds)).all()) and kinds.min(initial=0.0) >= 0.0
+    whole = bool((kinds == np.round(kinds)).all()) and kinds.min(initial=0.0) >= -1.0
     return whole and (classes > 1 or kinds.max(initial=0.0) != 1.0)
 
 

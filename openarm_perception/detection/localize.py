@@ -140,7 +140,7 @@ class Localizer:
         try:
             shape = footprint.fit(np.concatenate([edges, sides]), pixel)
             if shape.rms > self.config.prism_rms:
-                shape = footprint.bound(patch.points[solid][:, :2], pixel)
+                shape = footprint.bound(patch.points[solid][:, :2], pixel, pixel)
         except OpenArmError as error:
             raise _refusal(found, error.code, f": {error.message}") from error
         return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
@@ -175,7 +175,8 @@ class Localizer:
             raise _robot(patch.found, share)
         points = patch.points[inner if inner.any() else solid]
         top = self._top_height(points[:, 2], patch.band)
-        shape = footprint.bound(points[:, :2], 3.0 * float(np.median(patch.z[solid])) / patch.intrinsics.fx)
+        pixel = float(np.median(patch.z[solid])) / patch.intrinsics.fx
+        shape = footprint.bound(points[:, :2], pixel, 3.0 * pixel)
         around = self._detection(patch.found, shape, top, len(points), 0.0)
         kind, code = kind_of(patch.found.kind, around.size), withheld.code if withheld else around.code
         return replace(around, score=patch.found.score, kind=kind, measured=False, code=code)
@@ -202,7 +203,7 @@ class Localizer:
             points = plane.outline(found, intrinsics, T_base_camera, self.table_height, top, 0.5 * pixel)
             shape = footprint.fit(points, pixel)
             if shape.rms > self.config.prism_rms:
-                shape = footprint.bound(points, 0.0)
+                shape = footprint.bound(points, pixel, 0.0)
         except OpenArmError as error:
             raise _refusal(found, error.code, f": {error.message}") from error
         # a wrong height moves the object along the view: half of it, as its bottom stays where it is

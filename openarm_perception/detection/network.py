@@ -12,9 +12,12 @@ import ast
 import copy
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
+from threading import Timer
 from types import NoneType
 from typing import Any, cast
 
@@ -25,7 +28,7 @@ from pydantic import Field
 from openarm_common.config import Config, RunTimeField, load_yaml
 from openarm_common.detection import KINDS
 from openarm_common.errors import Code, OpenArmError, said
-from openarm_common.printable import brief, brief_text
+from openarm_common.printable import brief, brief_text, printable
 from openarm_common.resources import is_file, models_dir
 from openarm_perception.detection.boxes import Candidates, Letterbox, blob, suppress
 from openarm_perception.detection.detector import Detection2D, Image, require_rgb
@@ -39,6 +42,10 @@ _OF_THE_FILE = {"model", "names", "width", "height"}
 _MAX_NAMES = 2**16
 #: Largest number of a class, and largest side of an input, pixels: memory is taken for them.
 _MOST_CLASSES, _LARGEST = 10_000, 4096
+#: Names of classes that a message lists.
+_LISTED = 20
+#: Longest time that a network may take to be read, or for an image, and most memory of all networks of a process.
+_MOST_SECONDS, _MOST_BYTES = 30.0, 4 * 2**30
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 #: Outputs of DETR and its kin after their choice of the best.
 _LABELLED = {"boxes", "scores", "labels"}
@@ -46,7 +53,23 @@ _LABELLED = {"boxes", "scores", "labels"}
 _TARGET = "orig_target_sizes"
 #: Tasks of networks that give boxes, as the metadata names them.
 _TASKS = ("detect", "segment", "pose", "obb")
-_INPUT = "expected one image, channels first: (1, 3, h, w) of float, float16 or uint8"
+#: What other files are, by their first bytes; and why onnxruntime does not read one, by what it says.
+_OTHERS = {
+    b"PK\x03\x04": "a file of PyTorch or an archive; export it: yolo export model=best.pt format=onnx, or unzip it",
+    b"version https://git-lfs": "a pointer of Git LFS; get the file: git lfs pull",
+}
+_REASONS = (
+    (r'External data path does not exist: "([^"]*)', "has its weights in {0}, which is missing; copy it there"),
+    (
+        "Opset [0-9]+ is under development|IR version",
+        "is of a newer ONNX than onnxruntime {version} reads; export it again with opset=17, or update onnxruntime",
+    ),
+    (
+        r"opset import for domain '(.*?)'|(\S+)\(-?\d+\) is not a registered function/op|No Op registered for (\S+)",
+        "has operators that onnxruntime lacks ({0}{1}{2}); export it again without plugins",
+    ),
+)
+_INPUT = "expected one image, channels first: (1, 3, h, w) of float, float16 or uint8 (tf2onnx: --inputs-as-nchw)"
 _OUTPUT = (
     "expected (1, 4 + classes, n) as of YOLOv8, (1, n, 6) end to end, (1, n, 4 + classes) as of RT-DETR, (1, n, 5 +"
     " classes) as of YOLOv5 (not of YOLOX or YOLOv6, which take other images), or boxes, scores and labels;"
@@ -169,14 +192,24 @@ class NetworkDetector:
         return self._layout.table(self._main(self._outputs(image)))
 
     def _outputs(self, image: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        import onnxruntime
+
         name, *others = self._fed
         fed = {name: image.astype(self._type, copy=False), **dict.fromkeys(others, np.array([self.size]))}
+        options = onnxruntime.RunOptions()
         try:
-            outputs = self._session.run(None, fed)
+            with _limited(lambda: setattr(options, "terminate", True)):
+                outputs = self._session.run(None, fed, options)
             return {item.name: np.asarray(out) for item, out in zip(self._session.get_outputs(), outputs, strict=True)}
         # onnxruntime raises types of its own, which it does not document
         except Exception as error:
-            raise self._wrong(f"it does not run on a {self.size[0]}x{self.size[1]} image: {said(error)}") from error
+            why = "it takes more memory" if "BFCArena" in str(error) else said(error)
+            why = "it was stopped" if options.terminate else why
+            limits = f"{_MOST_SECONDS:g} s and {_MOST_BYTES / 2**30:g} GiB"
+            raise self._wrong(
+                f"it does not run on a {self.size[0]}x{self.size[1]} image within {limits}: {why}; export it again,"
+                " without loops, or a smaller one"
+            ) from error
 
     def _main(self, outputs: Mapping[str, NDArray[Any]]) -> NDArray[np.floating]:
         """Return the output (a, b) that has boxes, scores and classes."""
@@ -230,6 +263,8 @@ class NetworkDetector:
         extras = _extras(metadata, outputs)
         count = main.shape[0] - 4 - extras[0]
         many = 0 < count < main.shape[1]
+        if not many and main.shape[1] < 6:
+            raise self._unread(outputs)
         names, where = self._find_names(f"{count} classes" if many else "classes")
         layouts = (layout_of(main, len(names), extra, self.size) for extra in extras)
         layout = END_TO_END if outputs.keys() >= _LABELLED else next(filter(None, layouts), None)
@@ -307,19 +342,47 @@ def _open(path: Path) -> tuple[Any, dict[str, str]]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # cores are for the other nodes
     options.log_severity_level = 4  # the exception has the reason
+    options.add_session_config_entry("session.use_env_allocators", "1")
+    memory = onnxruntime.OrtMemoryInfo(
+        "Cpu", onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, onnxruntime.OrtMemType.DEFAULT
+    )
+    onnxruntime.create_and_register_allocator(memory, onnxruntime.OrtArenaCfg({"max_mem": _MOST_BYTES}))
     try:
         # by its default it prints a failure, and tries again
-        session = onnxruntime.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)
+        with _limited(lambda: options.set_load_cancellation_flag(True)):
+            session = onnxruntime.InferenceSession(str(path), options, ["CPUExecutionProvider"], enable_fallback=0)
         for item in (*session.get_inputs(), *session.get_outputs()):
             str(item)  # names that are no text fail here
         return session, dict(session.get_modelmeta().custom_metadata_map)
     # onnxruntime raises types of its own, which it does not document
     except Exception as error:
-        raise OpenArmError(
-            Code.CONFIG_INVALID,
-            f"network {path} ({path.stat().st_size} bytes) is damaged or no ONNX file: {said(error)}; export or copy it"
-            " again",
-        ) from error
+        raise OpenArmError(Code.CONFIG_INVALID, f"network {path} {_unreadable(path, str(error))}") from error
+
+
+def _unreadable(path: Path, error: str) -> str:
+    """Return what is wrong with a file that onnxruntime does not read, and what to do."""
+    with path.open("rb") as file:
+        first = file.read(64)
+    for magic, text in _OTHERS.items():
+        if first.startswith(magic):
+            return f"is {text}"
+    for pattern, text in _REASONS:
+        if found := re.search(pattern, error):
+            return text.format(*(group or "" for group in found.groups()), version=version("onnxruntime"))
+    text = brief_text(printable(error.rpartition("failed:")[2] or error))
+    return f"({path.stat().st_size} bytes) is damaged or no ONNX file: {text}; export or copy it again"
+
+
+@contextmanager
+def _limited(stop: Callable[[], object]) -> Iterator[None]:
+    """Stop what onnxruntime does after `_MOST_SECONDS`: a file may hold a loop without an end."""
+    timer = Timer(_MOST_SECONDS, stop)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _extras(metadata: Mapping[str, str], outputs: Mapping[str, NDArray[Any]]) -> tuple[int, ...]:
@@ -334,7 +397,8 @@ def _extras(metadata: Mapping[str, str], outputs: Mapping[str, NDArray[Any]]) ->
 
 
 def _listed(names: Sequence[str]) -> str:
-    return ", ".join(dict.fromkeys(names))
+    few = list(dict.fromkeys(names[:_LISTED]))
+    return ", ".join([*few, f"… ({len(names)} in all)"] if len(names) > _LISTED else few)
 
 
 def _names_of(path: Path, metadata: Mapping[str, str]) -> tuple[tuple[str, ...], str]:

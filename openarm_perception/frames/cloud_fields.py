@@ -50,11 +50,14 @@ def cloud_of(fields: Mapping[str, NDArray[np.generic]], shape: tuple[int, int]) 
     """
     with np.errstate(over="ignore", invalid="ignore"):
         points = np.stack([fields[axis].astype(np.float32) for axis in "xyz"], axis=-1).reshape(*shape, 3)
-    points[~np.isfinite(points).all(axis=-1)] = np.nan
+    # cameras give a point at their own place where they have measured nothing
+    points[~np.isfinite(points).all(axis=-1) | ~points.any(axis=-1)] = np.nan
     label = fields["label"].reshape(shape) if "label" in fields else None
     if label is not None and label.dtype.kind == "f":
         label = np.nan_to_num(label, nan=0.0, posinf=0.0, neginf=0.0).clip(-(2**31), 2**31)
-    return Cloud(points, _colors(fields, shape), None if label is None else label.astype(np.int64))
+    with np.errstate(over="ignore", invalid="ignore"):
+        rgb = _colors(fields, shape)
+    return Cloud(points, rgb, None if label is None else label.astype(np.int64))
 
 
 def refused(path: Path, what: str, expected: str) -> OpenArmError:

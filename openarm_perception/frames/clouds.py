@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,15 +32,20 @@ _METRES: Mapping[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 _READERS: Mapping[str, Callable[[Path], Cloud]] = {
     ".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy, ".xyz": read_xyz, ".xyzrgb": read_xyz, ".asc": read_xyz,
+    ".pts": read_xyz, ".txt": read_xyz, ".csv": read_xyz,
 }  # fmt: skip
-#: What is a cloud, too, and what it is.
+#: What is a cloud or a mesh, too: what to type.
+_CONVERTED = "convert it: pdal translate {path} {stem}.ply"
+_SAMPLED = "it is a mesh; sample points of it, with open3d: sample_points_uniformly"
 _FOREIGN = {
-    ".las": "LAS", ".laz": "LAZ", ".e57": "E57", ".pts": "PTS", ".ptx": "PTX",
+    ".las": _CONVERTED, ".laz": _CONVERTED, ".e57": _CONVERTED, ".ptx": _CONVERTED,
+    ".obj": _SAMPLED, ".stl": _SAMPLED, ".off": _SAMPLED, ".glb": _SAMPLED, ".gltf": _SAMPLED, ".dae": _SAMPLED,
+    ".npz": "it is an archive; save one of its arrays: np.save('{stem}.npy', np.load('{path}')['points'])",
 }  # fmt: skip
 #: An organised cloud is a pinhole camera's when its points are within this of their pixels, rms.
-_PINHOLE = 1.0
-#: Median distances of points that are none in metres.
-_FAR_M, _NEAR_M = 100.0, 0.02
+_PINHOLE = 0.5
+#: Median distances of points that are none in metres, and of those whose numbers are too large for millimetres.
+_FAR_M, _NEAR_M, _ASTRAY = 20.0, 0.02, 10_000.0
 #: Share of the points that lie before a camera, if they are its own; and smallest cloud.
 _AHEAD, _LEAST = 0.9, 100
 #: Points that are asked for their distance, and whether they lie before the camera.
@@ -92,11 +98,10 @@ def read_cloud(
     """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        kind = _FOREIGN.get(path.suffix.lower(), path.suffix)
-        how = f"convert it: pdal translate {path.name} {path.stem}.ply"
-        raise refused(path, f"is a {kind} file", f"{', '.join(_READERS)}; {how}")
+        how = _FOREIGN[path.suffix.lower()].format(path=path.name, stem=path.stem)
+        raise refused(path, f"is a file {path.suffix}", f"{', '.join(_READERS)}; {how}")
     cloud = reader(path)
-    cloud = Cloud(_metres(cloud.points, unit, path), cloud.rgb, cloud.label)
+    cloud = Cloud(_metres(cloud.points, unit, limits.far, path), cloud.rgb, cloud.label)
     if axes not in _CAMERAS:
         return _from_above(cloud if axes == "base" else _turned(cloud, _R_Z_UP_Y_UP), like)
     _require_ahead(cloud.points, axes, path)
@@ -149,19 +154,29 @@ def intrinsics_of(points: Points) -> Intrinsics:
     return lens
 
 
-def _metres(points: Points, unit: Unit, path: Path) -> Points:
+def _metres(points: Points, unit: Unit, far: float, path: Path) -> Points:
     """Return points in metres; refuse those that can hardly be."""
     scale = np.float32(_METRES[unit])
-    distance = np.linalg.norm(_some(points), axis=1)
+    some = _some(points)
+    distance = np.linalg.norm(some, axis=1)
     distance = distance[np.isfinite(distance)]
     if len(distance) < _LEAST:
         raise refused(path, f"has {len(distance)} points of finite numbers", f"at least {_LEAST}")
     middle = float(np.median(distance)) * float(scale)
-    if unit == "m" and middle > _FAR_M:
+    if middle > _ASTRAY:
+        x, y, z = (round(float(v)) for v in -np.nanmedian(some, axis=0))
+        matrix = f"1 0 0 {x} 0 1 0 {y} 0 0 1 {z} 0 0 0 1"
+        raise refused(
+            path,
+            f"has half of its points farther than {middle / 1e3:.0f} km from its origin",
+            f"it near them; type pdal translate {path.name} {path.stem}_near.ply -f filters.transformation"
+            f' --filters.transformation.matrix="{matrix}"',
+        )
+    if unit == "m" and middle > max(_FAR_M, far):
         raise refused(
             path,
             f"has half of its points farther than {middle:.0f} m",
-            "metres; of millimetres type --unit mm, of centimetres --unit cm",
+            f"metres; of millimetres type --unit mm, of centimetres --unit cm, else --far {math.ceil(2.0 * middle)}",
         )
     if unit != "m" and middle < _NEAR_M:
         text = f"has half of its points nearer than {middle * 1e3:.2g} mm by --unit {unit}"

@@ -19,6 +19,7 @@ from openarm_perception.detection.detector import ColorDetector, Detection2D
 from openarm_perception.frames.images import Frame
 from openarm_perception.geometry.depth import DepthLimits, Points
 from openarm_perception.segmentation.clusters import Cluster, Segmentation, segment
+from openarm_perception.segmentation.divide import SegmentationConfig
 from openarm_perception.segmentation.draw import depth_picture, label_picture, overlay
 
 #: Points that are asked whether they lie below the support, and so deep, m.
@@ -28,6 +29,8 @@ _UNITS = {0.0001: "D405", 0.0002: "TUM's 5000 a metre", 0.00025: "L515", 0.01: "
 _OF_FLOATS = {0.001: "millimetres", 0.01: "centimetres"}
 #: Table tops are seen from within these, m.
 _NEAR, _FAR = 0.15, 1.5
+#: What counts as a thing.
+_CONFIG = SegmentationConfig()
 #: A thing has a colour when so many of its pixels have it.
 _COLORED = 0.5
 
@@ -72,6 +75,31 @@ class Found:
         first, last = np.nanpercentile(self.frame.points[..., 2], (5.0, 95.0))
         return float(first), float(last)
 
+    @property
+    def spacing(self) -> tuple[float, float]:
+        """Distances of neighbouring points at those depths, m."""
+        first, last = self.depths
+        return first * self._pixel, last * self._pixel
+
+    @property
+    def least(self) -> float:
+        """What is smaller than this across at the farther of these depths is no thing, m."""
+        return max(_CONFIG.least_size, math.sqrt(_CONFIG.least_pixels) * self.spacing[1])
+
+    @property
+    def _pixel(self) -> float:
+        """Metres across of a pixel at 1 m."""
+        return 2.0 / (self.frame.intrinsics.fx + self.frame.intrinsics.fy)
+
+    def known_to(self, one: Cluster) -> float:
+        """Return how exactly the size of a cluster is known, m.
+
+        An edge of a prism lies between two rows of points; the box around anything else ends at single ones of them.
+        """
+        z = float(np.median(self.frame.points[one.window][one.mask, 2]))
+        prism = one.shape.kind != "unknown"
+        return 1.5 * self._pixel * z if prism else 2.0 * (self._pixel * z + self.segmentation.support.noise * z * z)
+
     def unit_hint(self) -> str:
         """Say which other unit of depth would fit, where it is far or near for a table top; "" where it is not."""
         return _other_units(self.frame.points[..., 2], self.frame.assumed)
@@ -83,6 +111,7 @@ class Found:
         return {
             "frame": "base" if self.placed else "camera",
             "depths": [round(v, 4) for v in self.depths],
+            "spacing": [round(v, 5) for v in self.spacing],
             "intrinsics": {name: round(float(getattr(lens, name)), 3) for name in ("fx", "fy", "cx", "cy")},
             "support": {
                 "normal": [round(float(v), 5) for v in support.normal], "offset": round(support.offset, 5),
@@ -100,22 +129,23 @@ class Found:
             ],
         }  # fmt: skip
 
-    @staticmethod
-    def _cluster(one: Cluster, color: str) -> dict[str, Any]:
+    def _cluster(self, one: Cluster, color: str) -> dict[str, Any]:
         return {
             "id": one.id, "pixels": one.pixels, "centre": [round(float(v), 5) for v in one.T_frame_box[:3, 3]],
-            "size": [round(float(v), 5) for v in one.size], "shape": one.shape.kind, "why": one.shape.why,
+            "size": [round(float(v), 5) for v in one.size], "known_to": round(self.known_to(one), 5),
+            "shape": one.shape.kind, "why": one.shape.why,
             "color": color, "rgb": None if one.color is None else list(one.color),
             "cut": one.outline.cut, "outline": {name: round(v, 4) for name, v in vars(one.outline).items()},
         }  # fmt: skip
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return a row of text for each cluster: number, colour, shape, edges, place, pixels, remarks."""
+        """Return a row of text for each cluster: number, colour, shape, edges, to what, place, pixels, remarks."""
         out: list[tuple[str, ...]] = []
         for one, color in zip(self.segmentation.clusters, self.colors, strict=True):
             edges = " x ".join(f"{edge * 1e3:.0f}" for edge in one.size)
             place = " ".join(f"{v:+.3f}" for v in one.T_frame_box[:3, 3])
-            out.append((str(one.id), color, one.shape.kind, edges, place, str(one.pixels), one.shape.why))
+            exact = f"{max(1.0, self.known_to(one) * 1e3):.0f}"
+            out.append((str(one.id), color, one.shape.kind, edges, exact, place, str(one.pixels), one.shape.why))
         return out
 
     def write(self, folder: Path) -> tuple[Path, ...]:
@@ -170,7 +200,7 @@ def find(
     measured, frame = frame.points[..., 2], replace(frame, points=_within(frame.points, limits))
     try:
         result = segment(
-            frame.points, frame.intrinsics, rgb=frame.rgb, T_base_camera=T_base_camera,
+            frame.points, frame.intrinsics, _CONFIG, rgb=frame.rgb, T_base_camera=T_base_camera,
             background=None if background is None else _within(background, limits),
         )  # fmt: skip
     except OpenArmError as error:

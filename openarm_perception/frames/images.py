@@ -20,7 +20,7 @@ from openarm_common.camera.pictures import decode_picture, to_bytes
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array, Bytes, Floats
 from openarm_perception.frames.cloud_fields import MOST_POINTS
-from openarm_perception.frames.plain import read_array
+from openarm_perception.frames.plain import is_image, numbers, read_array
 from openarm_perception.geometry.depth import Deprojector, DepthLimits, Points
 
 #: Most bytes of a file with an image, and of one with numbers.
@@ -99,18 +99,15 @@ def _organised(counts: DepthImage, lens: Lens, depth_scale: float | None, limits
 
 
 def is_depth(path: Path) -> bool:
-    """Whether an array in a file is a depth image (h, w), and no cloud (n, 3) or (n, 6)."""
-    if path.suffix.lower() != ".npy":
-        return False
-    shape = read_array(path, "a cloud or a depth image").shape
-    return len(shape) == 2 and shape[1] > 6
+    """Whether an array in a file is a depth image (h, w), and no cloud (n, k)."""
+    return path.suffix.lower() == ".npy" and is_image(read_array(path))
 
 
 def _read_counts(path: Path, lens: Lens) -> DepthImage:
     expected = "a depth image: one channel of 16 bits, or of floats"
     if path.suffix.lower() == ".npy":
         expected += "; (h, w), such as depth.astype(numpy.uint16)"
-        z = _checked_size(read_array(path, expected), path)
+        z = _checked_size(numbers(read_array(path), path, expected), path)
         kind = np.float32 if z.dtype.kind == "f" else np.uint16 if z.dtype.name == "uint16" else None
         if kind is not None and z.ndim == 2:
             with np.errstate(over="ignore"):

@@ -116,7 +116,7 @@ def _header(data: bytes, path: Path) -> _Header:
         raise refused(path, f"has {width} by {height} points", "at least one: lines WIDTH and HEIGHT")
     if width * height > MOST_POINTS:
         raise refused(path, f"has {width} by {height} points", f"at most {MOST_POINTS}")
-    form = " ".join(lines["DATA"])
+    form = " ".join(lines["DATA"]).lower()
     if form not in _FORMS:
         raise refused(path, f"has data of the form {form[:40]!r}", ", ".join(_FORMS))
     return _Header(names, tuple(types), counts, width, height, form, begin)
@@ -182,7 +182,7 @@ def _words(data: bytes, head: _Header, path: Path) -> dict[str, NDArray[np.gener
                 out[name] = column.astype(np.float64).astype(kind)
             at += number
     except (ValueError, OverflowError) as error:
-        raise refused(path, "has a value that is no number", "numbers or nan") from error
+        raise refused(path, "has a value that is no number", "numbers with a decimal point, or nan") from error
     return out
 
 

@@ -191,7 +191,7 @@ def _words(text: Bytes, path: Path) -> NDArray[np.float64]:
     try:
         return np.fromstring(text.tobytes().decode("ascii", errors="replace"), np.float64, sep=" ")
     except (ValueError, DeprecationWarning) as error:
-        raise refused(path, "has a value that is no number", "numbers or nan") from error
+        raise refused(path, "has a value that is no number", "numbers with a decimal point, or nan") from error
 
 
 def _lines(data: Bytes, element: _Element, path: Path) -> int:

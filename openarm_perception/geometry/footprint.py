@@ -21,6 +21,8 @@ Kind = Literal["rectangle", "circle", "bound"]
 
 #: Cells that the walls of a cloud are found in are no smaller, m.
 _CELL = 0.0025
+#: Nor than so many pixels, as what is seen at a slant has its points farther apart.
+_APART = 1.5
 
 
 @dataclass(frozen=True)
@@ -50,12 +52,13 @@ class Footprint:
 ANY_YAW_STD = math.pi / math.sqrt(12.0)
 
 
-def fit(outline: Array, spacing: float) -> Footprint:
+def fit(outline: Array, spacing: float, *, whole: bool = False) -> Footprint:
     """Return the rectangle or the circle through an outline, whichever lies nearer to it.
 
     Args:
         outline: (n, 2) points on the edges, m.
         spacing: Distance of neighbouring points, m (the size of a pixel).
+        whole: Whether nothing hides a part of it: sides of few pixels are known by as few points.
 
     Raises:
         OpenArmError: NOTHING_DETECTED, when there are too few points, or too much of the outline is hidden.
@@ -65,28 +68,29 @@ def fit(outline: Array, spacing: float) -> Footprint:
             Code.NOTHING_DETECTED, f"outline has {len(outline)} points, expected at least 12; the object is too small"
         )
     circle, to_circle = _fit_circle(outline, spacing)
-    rectangle, to_rectangle = _fit_rectangle(outline, spacing)
+    rectangle, to_rectangle = _fit_rectangle(outline, spacing, whole)
     best = circle if to_circle < to_rectangle else rectangle
     if isinstance(best, str):
         raise OpenArmError(Code.NOTHING_DETECTED, best)
     return best
 
 
-def bound(points: Array, spacing: float) -> Footprint:
+def bound(points: Array, pixel: float, missing: float) -> Footprint:
     """Return the rectangle around points (n, 2), m, along most of its walls: for what is neither rectangle nor circle.
 
     Args:
         points: Seen ones, m.
-        spacing: That the rectangle is larger by, m: half a pixel is missing on every side that faces away.
+        pixel: Distance of neighbouring points across the view, m.
+        missing: By which the rectangle is larger, m: half a pixel is missing on every side that faces away.
     """
-    yaw = wall_yaw(points, max(spacing, _CELL))
+    yaw = wall_yaw(points, max(_APART * pixel, _CELL))
     local = points @ _rotation(yaw)
     low, high = local.min(axis=0), local.max(axis=0)
     centre = _rotation(yaw) @ (0.5 * (low + high))
     width, length = high - low
     if width > length:
         width, length, yaw = length, width, yaw + math.pi / 2.0
-    smaller, larger = float(width) + spacing, float(length) + spacing
+    smaller, larger = float(width) + missing, float(length) + missing
     std = (0.1 * smaller, 0.1 * larger)
     return Footprint("bound", centre, _half_turn(yaw), (smaller, larger), 0.0, std, math.radians(10.0))
 
@@ -124,7 +128,7 @@ def _fit_circle(outline: Array, spacing: float) -> tuple[Footprint | str, float]
     return Footprint("circle", shift + centre, 0.0, size, rms, (std, std), ANY_YAW_STD), rms
 
 
-def _fit_rectangle(outline: Array, spacing: float) -> tuple[Footprint | str, float]:
+def _fit_rectangle(outline: Array, spacing: float, whole: bool) -> tuple[Footprint | str, float]:
     (cx, cy), (width, height), angle_deg = cv2.minAreaRect((outline * 1e3).astype(np.float32))
     centre = np.array([cx, cy]) * 1e-3
     half = np.array([width, height]) * 0.5e-3
@@ -133,10 +137,10 @@ def _fit_rectangle(outline: Array, spacing: float) -> tuple[Footprint | str, flo
     for step in range(6):
         local = _to_local(outline, centre, yaw)
         # one stray point stretches the first rectangle, so the first assignment is generous and the later ones are not
-        sides = _assign(local, half, spacing, 0.3 * float(half.min()) * 0.5**step)
+        sides = _assign(local, half, spacing, 0.3 * float(half.min()) * 0.5**step, whole)
         for index, side in enumerate(sides):
             # the direction comes from all sides, so a short piece is enough to locate its side
-            if len(side) < 6:
+            if len(side) < (np.clip(half[1 - index // 2] / spacing, 3, 6) if whole else 6):
                 text = f"an edge across the {('first', 'second')[index // 2]} axis of the outline is in view at"
                 text += f" {len(side)} points only; something hides the object"
                 return text, _rectangle_rms(local, half)
@@ -174,7 +178,7 @@ def _to_local(outline: Array, centre: Array, yaw: float) -> Array:
     return (outline - centre) @ _rotation(yaw)
 
 
-def _assign(local: Array, half: Array, spacing: float, slack: float) -> list[Array]:
+def _assign(local: Array, half: Array, spacing: float, slack: float, whole: bool) -> list[Array]:
     """Points of the sides -x, +x, -y, +y; without those near a corner, whose side is open, and without strays."""
     x, y = local.T
     distance = np.abs(np.stack([x + half[0], x - half[0], y + half[1], y - half[1]], axis=1))
@@ -185,7 +189,8 @@ def _assign(local: Array, half: Array, spacing: float, slack: float) -> list[Arr
     for index in range(4):
         axis = index // 2
         along = np.abs(local[:, 1 - axis])
-        keep = (nearest == index) & (residual <= limit) & (along < half[1 - axis] - 1.5 * spacing)
+        corner = min(1.5 * spacing, 0.3 * float(half[1 - axis])) if whole else 1.5 * spacing
+        keep = (nearest == index) & (residual <= limit) & (along < half[1 - axis] - corner)
         sides.append(local[keep])
     return sides
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +18,8 @@ from openarm_perception.geometry.depth import DepthLimits, View
 
 #: Depth with less noise than this is used as it is, m; 16UC1 alone rounds by 0.3 mm (1 sigma).
 _CLEAN = 0.0006
+#: Or with less than so many pixels across.
+_COARSE = 0.75
 #: More pixels without depth than this share, and it is used as it is no more.
 _FEW_HOLES = 0.001
 #: Stands for no depth among depths, m.
@@ -71,7 +74,7 @@ def cut(found: Detection2D, view: View, limits: DepthLimits, top_band: float) ->
     v0, v1 = max(v - _MARGIN, 0), min(v + h + _MARGIN, intrinsics.height)
     z = view.depth[v0:v1, u0:u1] * scale
     z = np.where((z >= limits.near) & (z <= limits.far), z, np.nan)
-    z, noise = denoise(z)
+    z, noise = denoise(z, 2.0 / (intrinsics.fx + intrinsics.fy))
     x = (np.arange(u0, u1) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(v0, v1) - intrinsics.cy) / intrinsics.fy
     in_camera = np.stack([*np.meshgrid(x, y), np.ones(z.shape)], axis=-1)
@@ -84,21 +87,35 @@ def cut(found: Detection2D, view: View, limits: DepthLimits, top_band: float) ->
     return Patch(found, intrinsics, T_base_camera, rays, z, points, coloured, hidden, band)
 
 
-def denoise(z: Array | NDArray[np.float32]) -> tuple[Array, float]:
-    """Depth without the noise and dropouts of a real sensor, and the noise that is left, m; clean depth stays."""
+def denoise(z: Array | NDArray[np.float32], pixel: float) -> tuple[Array, float]:
+    """Depth without the noise and dropouts of a real sensor, and the noise that is left, m; clean depth stays.
+
+    Args:
+        z: (h, w) m, NaN where nothing was measured.
+        pixel: Metres across of a pixel at 1 m; a median over coarse ones would round off more than noise does.
+    """
     holes = np.isnan(z)
+    noise, depth = _noise(z), z[~holes]
+    middle = float(np.median(depth[:: max(1, len(depth) // _ASKED)])) if len(depth) else 0.0
+    coarse = _COARSE * pixel * middle
+    clean = noise < max(_CLEAN, coarse)
+    if clean and np.count_nonzero(holes) < _FEW_HOLES * z.size:
+        return z.astype(np.float64), noise
     # the median keeps edges where they are; a hole counts as far away, as what lies behind the object
     smooth = cv2.medianBlur(np.where(holes, np.float32(_FAR), z).astype(np.float32), 5).astype(np.float64)
-    residual = np.abs(smooth - z)[~holes]
-    residual = np.sort(residual[:: max(1, len(residual) // _ASKED)])
-    # without the tenth that lies on edges; the median alone would be 0 where whole millimetres hide the noise
-    inner = residual[: len(residual) * 9 // 10]
-    noise = 1.25 * float(np.sqrt(np.mean(inner**2))) if len(inner) else 0.0
-    if noise < _CLEAN and np.count_nonzero(holes) < _FEW_HOLES * z.size:
-        return z.astype(np.float64), noise
     smooth[smooth > 0.99 * _FAR] = np.nan
     # a median of 25 leaves a quarter of the noise (sqrt(pi / 2 / 25))
-    return smooth, 0.25 * noise
+    return (np.where(holes, smooth, z), noise) if clean and coarse > _CLEAN else (smooth, 0.25 * noise)
+
+
+def _noise(z: Array | NDArray[np.float32]) -> float:
+    """Return the noise of depths (h, w), m, by the smaller half of their second differences: without edges."""
+    bends = np.concatenate([np.abs(np.diff(z, 2, axis=axis)).ravel() for axis in (0, 1)])
+    bends = bends[np.isfinite(bends)]
+    bends = np.sort(bends[:: max(1, len(bends) // _ASKED)])
+    inner = bends[: len(bends) // 2]
+    # sqrt(6) times the noise is theirs, of which the smaller half has 0.378
+    return float(np.sqrt(np.mean(inner.astype(np.float64) ** 2))) / (0.378 * math.sqrt(6.0)) if len(inner) else 0.0
 
 
 def keep_edges(z: Array | NDArray[np.float32], smooth: Array, noise: float, pixel: float) -> Array:

@@ -148,10 +148,10 @@ class _Image:
         window, T = _window(label, i), self.T_frame_camera
         mask, local, z = label[window] == i, self.surface[window], self.points[window][..., 2]
         other = ((label[window] != 0) & ~mask) | self.robot[window]
-        depth, lens = float(np.median(z[mask])), self.intrinsics
+        lens = self.intrinsics
         shape = judge(
             mask, other, z, _rays(lens, window, T_plane_camera), self.support.offset, outline.cut,
-            2.0 / (lens.fx + lens.fy) * depth,
+            2.0 / (lens.fx + lens.fy),
         )  # fmt: skip
         T_plane_box = se3.make(se3.rot_z(shape.footprint.yaw), (*shape.footprint.centre, shape.height / 2.0))
         color = None

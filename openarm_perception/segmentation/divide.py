@@ -114,7 +114,7 @@ def divide(
     pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
     noise = np.float32(support.noise)
     z = points[..., 2]
-    smooth, left = denoise(z)
+    smooth, left = denoise(z, pixel)
     even = _points(smooth, intrinsics)
     heights = support.heights(even)
     # without the noise of single pixels, what is as low as that may be a thing

@@ -65,9 +65,10 @@ def judge(mask: Mask, other: Mask, z: NDArray[np.float32], rays: Array, eye: flo
         rays: (h, w, 3) directions of unit depth of the pixels: two along the plane, and up; the camera is at (0, 0).
         eye: Height of the camera over the plane, m.
         hidden: What cuts its outline; a prism is not fitted to what is seen in part.
-        pixel: Distance of neighbouring pixels at its depth, m.
+        pixel: Metres across of a pixel at 1 m.
     """
-    smooth, left = denoise(z.astype(np.float64))
+    smooth, left = denoise(z.astype(np.float64), pixel)
+    pixel *= float(np.median(z[mask]))
     flat: Array = rays * smooth[..., None] + (0.0, 0.0, eye)
     solid = mask & np.isfinite(smooth)
     if np.count_nonzero(solid) < _FEW:
@@ -79,11 +80,11 @@ def judge(mask: Mask, other: Mask, z: NDArray[np.float32], rays: Array, eye: flo
     # the pixels of its border lie anywhere between it and what is behind
     inner = cv2.erode(solid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     whole = np.count_nonzero(inner) > 0.5 * np.count_nonzero(solid)
-    around = footprint.bound(flat[inner][:, :2] if whole else points[:, :2], (3.0 if whole else 1.0) * pixel)
+    around = footprint.bound(flat[inner][:, :2] if whole else points[:, :2], pixel, (2.0 if whole else 1.0) * pixel)
     if hidden:
         return Shape(around, top, f"its outline is cut by {hidden}")
     try:
-        shape = footprint.fit(_edges(flat, solid, other, rays, top, eye, band), pixel)
+        shape = footprint.fit(_edges(flat, solid, other, rays, top, eye, band), pixel, whole=True)
     except OpenArmError:
         return Shape(around, top, "its top is neither rectangular nor round")
     if shape.rms > np.hypot(_RMS, 0.5 * pixel):

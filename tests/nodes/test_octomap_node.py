@@ -159,7 +159,9 @@ def test_maps_are_saved_and_loaded_and_damaged_files_leave_the_map_alone(bench, 
         "damaged.bt": "octree is damaged",
         "cloud.bt": "not an octree",
         "none.bt": "No such file",
-        "a.pcd": "suffix",
+        "a.pcd": "a file that ends in .bt or .ot; a cloud is inserted",
+        "a.yaml": "a flat map, as of Nav2, has no heights",
+        "a.bt.gz": "unpack it: gunzip",
     }
     for name, text in refused.items():
         answer = file("load", tmp_path / name)

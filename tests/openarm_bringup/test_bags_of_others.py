@@ -30,6 +30,7 @@ from openarm_bringup.bags.bag import Bag, BagWriter, open_bag
 from openarm_bringup.bags.definitions import event_definition
 from openarm_bringup.bags.files import is_recording
 from openarm_bringup.bags.ros.listener import from_profile
+from openarm_bringup.bags.ros.messages import messages_of
 from openarm_bringup.calibration.source import ALL_SAMPLES, opened
 from openarm_bringup.commands.perceive import perceive
 from openarm_bringup.commands.record import replay
@@ -282,6 +283,15 @@ def test_a_type_that_changed_within_a_recording_is_named(tmp_path: Path) -> None
         assert "other fields of std_msgs/msg/String" in bag.why_not("/a")
 
 
+def test_messages_of_other_fields_are_not_misread(tmp_path: Path) -> None:
+    """Their bytes may make a message of the installed type, too: here the first of two texts."""
+    two = Topic("/a", STRING, [(1, cdr("one") + b"two\0")], text=b"string data\nchar[4] more\n")
+    same = strings("/b", [1])._replace(text=b"string data\nchar[4] more\n")
+    with open_bag(unchunked(tmp_path / "a.mcap", [two, same])) as bag:
+        refused("other fields of std_msgs/msg/String .*read it with the version that made it", messages_of, bag, ["/a"])
+        assert [message.data for message in messages_of(bag, ["/b"])["/b"]] == ["/b 1"]
+
+
 def test_several_publishers_of_a_topic_are_replayed_with_what_serves_all_subscribers(tmp_path: Path) -> None:
     types = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -437,7 +447,7 @@ def test_other_files_are_named_by_their_content(tmp_path: Path, name: str, conte
 
 
 def test_recordings_are_known_by_name_or_content(tmp_path: Path) -> None:
-    for name in ("a.mcap", "a.db3", "a.db3.zstd", "a.mcap.zst", "a.bag"):
+    for name in ("a.mcap", "a.db3", "a.db3.zstd", "a.mcap.zst", "a.bag", "a.mcap.gz", "a.ZIP"):
         (tmp_path / name).write_bytes(b"")
         assert is_recording(tmp_path / name)
     unchunked(tmp_path / "no_suffix", [strings("/a", [1])])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from sensor_msgs.msg import PointCloud2, PointField
 
 from openarm_common import se3
 from openarm_common.ros import convert
@@ -58,3 +59,31 @@ def test_a_cloud_without_points_is_a_message_too() -> None:
     cloud = convert.cloud_from_points(np.empty((0, 3), np.float32), "camera", 0)
     assert (cloud.width, cloud.height, len(cloud.data)) == (0, 1, 0)
     assert convert.points_from_cloud(cloud).shape == (0, 3)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(("kind", "first", "step"), [("f4", 0, 22), ("f4", 4, 26), ("f8", 0, 32), ("f4", 16, 48)])
+@pytest.mark.parametrize("padding", [0, 7])
+def test_clouds_of_drivers_are_read_in_any_layout(order: str, kind: str, first: int, step: int, padding: int) -> None:
+    """As those of lidars: 22 bytes a point of Velodyne, 26 of Livox; gaps, rows with padding, either byte order."""
+    points = np.random.default_rng(1).random((4, 6, 3)).astype(np.float32)
+    size = np.dtype(kind).itemsize
+    formats = {"names": list("xyz"), "formats": [order + kind] * 3, "offsets": [first + size * i for i in range(3)]}
+    table = np.zeros((4, 6), np.dtype({**formats, "itemsize": step}))
+    for i, axis in enumerate("xyz"):
+        table[axis] = points[..., i]
+    rows = np.pad(np.frombuffer(table.tobytes(), np.uint8).reshape(4, -1), ((0, 0), (0, padding)))
+    message = PointCloud2(height=4, width=6, is_bigendian=order == ">", point_step=step, row_step=6 * step + padding)
+    datatype = {"f4": PointField.FLOAT32, "f8": PointField.FLOAT64}[kind]
+    message.fields = [PointField(name="intensity", offset=first + 3 * size, datatype=2, count=1)]
+    message.fields += [
+        PointField(name=a, offset=first + size * i, datatype=datatype, count=1) for i, a in enumerate("xyz")
+    ]
+    message.data = rows.tobytes()
+    read = convert.points_from_cloud(message)
+    np.testing.assert_array_equal(read, points)
+    assert (read.dtype, read.flags.aligned) == (np.float32, True)
+    message.data = rows.tobytes()[: -padding - 1]
+    refused("expected steps of at least", convert.points_from_cloud, message)
+    message.fields[1].datatype = PointField.INT16
+    refused("expected x, y, z of FLOAT32", convert.points_from_cloud, message)

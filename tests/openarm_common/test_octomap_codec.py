@@ -112,6 +112,7 @@ HEAD = b"# Octomap OcTree binary file\nid OcTree\nsize 17\nres 0.02\ndata\n"
     [
         (b"", "not an octree file"),
         (b"P5\n640 480\ndata\n", "not an octree file"),
+        (b"\x1f\x8b\x08" + HEAD, "not an octree file.*; unpack it: gunzip"),
         (HEAD[:-5], "not an octree file"),
         (
             HEAD.replace(b" binary", b"").replace(b"id OcTree", b"id CountingOcTree"),

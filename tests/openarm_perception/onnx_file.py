@@ -69,3 +69,26 @@ def boxes(*rows: tuple[float, ...], cells: int = 100, classes: int = 2) -> np.nd
         out[0, :4, i] = ((left + right) / 2, (top + bottom) / 2, right - left, bottom - top)
         out[0, 4 + int(kind), i] = score
     return out
+
+
+def write_endless(path: Path, *, growing: bool) -> Path:
+    """A file whose only node is a Loop without an end; `growing` doubles what it carries each time."""
+
+    def node(kind: str, ins: tuple[str, ...], out: str, *attributes: bytes) -> bytes:
+        named = b"".join(field(1, name.encode()) for name in ins) + field(2, out.encode()) + field(4, kind.encode())
+        return field(1, named + b"".join(field(5, attribute) for attribute in attributes))
+
+    def value(number: int, name: str, shape: tuple[int | str, ...], kind: int) -> bytes:
+        return field(number, field(1, name.encode()) + field(2, tensor_type(shape, kind)))
+
+    axis = field(1, b"axis") + field(3, 0) + field(20, 2)
+    body = node("Concat", ("x", "x"), "y", axis) if growing else node("Identity", ("x",), "y")
+    body += node("Identity", ("on",), "still_on") + field(2, b"body")
+    body += value(11, "i", (), 7) + value(11, "on", (), 9) + value(11, "x", ("n",), 1)
+    body += value(12, "still_on", (), 9) + value(12, "y", ("m",), 1)
+    graph = node("Loop", ("", "true", "start"), "output0", field(1, b"body") + field(6, body) + field(20, 5))
+    graph += field(2, b"graph") + value(11, "images", (1, 3, 256, 320), 1) + value(12, "output0", ("k",), 1)
+    graph += field(5, field(2, 9) + field(8, b"true") + field(9, b"\1"))
+    graph += field(5, field(1, 100) + field(2, 1) + field(8, b"start") + field(9, bytes(400)))
+    path.write_bytes(field(1, 8) + field(7, graph) + field(8, field(1, b"") + field(2, 17)))
+    return path

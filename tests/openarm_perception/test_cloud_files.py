@@ -166,7 +166,34 @@ def test_arrays_and_text_are_read(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").write_text("1 2 3\n1 2\n")
     refused("of another length", read_xyz, tmp_path / "a.xyz")
     (tmp_path / "a.xyz").write_text("a cloud\n")
-    refused("has 0 points", read_xyz, tmp_path / "a.xyz")
+    refused("has 0 points|points of 0 numbers", read_xyz, tmp_path / "a.xyz")
+
+
+@pytest.mark.parametrize("separator", [" ", ";", "\t", "; "])
+def test_decimal_commas_and_a_count_of_points_are_noticed(tmp_path: Path, separator: str) -> None:
+    """As spreadsheets and PTS files have them."""
+    rows = "\n".join(separator.join(f"{v:.6f}".replace(".", ",") for v in p) for p in POINTS)
+    (tmp_path / "a.txt").write_text(f"{len(POINTS)}\n{rows}\n")
+    np.testing.assert_allclose(read_xyz(tmp_path / "a.txt").points, POINTS[None], atol=1e-6)
+
+
+def test_normals_are_no_colours_and_records_are_read_by_name(tmp_path: Path) -> None:
+    normals = np.tile((0.6, 0.0, -0.8), (6, 1))
+    np.save(tmp_path / "a.npy", np.hstack([POINTS, normals]))
+    assert read_npy(tmp_path / "a.npy").rgb is None
+    np.save(tmp_path / "a.npy", np.hstack([POINTS, normals, RGB]))
+    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy").rgb, RGB[None])
+    records = np.zeros(6, [("t", "U4"), ("z", "f8"), ("y", "f4"), ("x", "f4"), ("intensity", "u2")])
+    for i, axis in enumerate("xyz"):
+        records[axis] = POINTS[:, i]
+    np.save(tmp_path / "a.npy", records)
+    np.testing.assert_array_equal(read_npy(tmp_path / "a.npy").points, POINTS[None])
+
+
+@pytest.mark.parametrize("shape", [(3, 200), (3, 48, 64), (48, 64)])
+def test_arrays_that_are_no_rows_of_points_are_refused_with_a_way_out(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    np.save(tmp_path / "a.npy", np.ones(shape))
+    refused(r"transpose an array \(3, n\).*a depth image needs --info", read_npy, tmp_path / "a.npy")
 
 
 def test_a_pcd_that_is_not_organised_is_read(tmp_path: Path) -> None:
@@ -265,6 +292,14 @@ def test_a_cloud_with_z_up_is_seen_from_above(write: Write) -> None:
     assert like.frame.points.shape == read.frame.points.shape
 
 
+def test_a_point_in_the_camera_is_none(write: Write) -> None:
+    """As drivers fill up organised clouds."""
+    points = view()
+    read = read_cloud(write(np.nan_to_num(points)), LIMITS)
+    np.testing.assert_array_equal(read.frame.points, points)
+    assert read.note == ""
+
+
 def test_an_organised_cloud_of_no_pinhole_camera_is_projected(write: Write) -> None:
     """As of a lidar: a point per angle."""
     a, b = np.meshgrid(np.linspace(-0.9, 0.9, 120), np.linspace(-0.6, 0.6, 90))
@@ -276,7 +311,13 @@ def test_an_organised_cloud_of_no_pinhole_camera_is_projected(write: Write) -> N
 
 
 def test_other_files_are_named_with_a_way_out(tmp_path: Path, write: Write) -> None:
-    refused("is a LAS file.*pdal translate a.las a.ply", read_cloud, tmp_path / "a.las", LIMITS)
+    refused(r"is a file \.las.*pdal translate a.las a.ply", read_cloud, tmp_path / "a.las", LIMITS)
+    refused(r"is a mesh; sample points", read_cloud, tmp_path / "a.stl", LIMITS)
+    refused(r"np.save\('a.npy', np.load\('a.npz'\)", read_cloud, tmp_path / "a.npz", LIMITS)
+    refused(r"--unit cm, else --far 1\d\d", read_cloud, write(strewn(view()) * 100.0), LIMITS)
+    read_cloud(write(strewn(view()) * 100.0), DepthLimits(near=0.1, far=200.0))
+    far = write(strewn(view()) + np.array([5e5, 5e6, 200.0]))
+    refused('pdal translate a.pcd a_near.ply .*"1 0 0 -5000.. 0 1 0 -5000000 0 0 1 -2', read_cloud, far, LIMITS)
     refused("at least 100", read_cloud, write(POINTS[None]), LIMITS)
     refused("can't be read|can't read", read_cloud, tmp_path / "none.ply", LIMITS)
     (tmp_path / "empty.ply").touch()

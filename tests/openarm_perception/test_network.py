@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_perception.detection import network
 from openarm_perception.detection.detector import rank
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
-from tests.openarm_perception.onnx_file import boxes, write_network
+from tests.openarm_perception.onnx_file import boxes, field, write_endless, write_network
 from tests.openarm_perception.onnx_layouts import BALL, BOX, OBB, READ
 from tests.refusals import refused, refuses
 
@@ -134,10 +135,20 @@ def test_a_turned_box_becomes_the_box_around_it(tmp_path) -> None:
     assert found.centre == (319.5, 239.5)
 
 
+def test_rows_of_no_class_are_none(tmp_path) -> None:
+    """As exporters pad them."""
+    rows = np.full((1, 300, 6), -1.0)
+    rows[0, 0] = (10.0, 20.0, 60.0, 80.0, 0.9, 0.0)
+    (found,) = make(tmp_path, rows).detect(IMAGE)
+    assert found.label == "box"
+
+
 def test_a_network_that_gives_no_row_for_a_grey_image_is_read(tmp_path) -> None:
     assert make(tmp_path, np.zeros((1, 0, 6))).detect(IMAGE) == ()
 
 
+#: As of YOLO-NAS.
+NAS = {"boxes": np.zeros((1, 84, 4), np.float32), "scores": np.zeros((1, 84, 9), np.float32)}
 #: The answers to queries before the choice of the best, as of DETR.
 QUERIES = {"boxes": np.zeros((1, 3, 4), np.float32), "logits": np.zeros((1, 3, 2), np.float32)}
 
@@ -157,7 +168,8 @@ QUERIES = {"boxes": np.zeros((1, 3, 4), np.float32), "logits": np.zeros((1, 3, 2
         (np.array([[[5, 5, 9, 9, 0.5, 3]]]), {}, r"finds class 3, but only 0 to 1 have names \(box, ball\): give all"),
         (np.full((1, 6, 100), 3.0), {}, "scores go from 0 to 3, expected 0 to 1; export it with its sigmoid"),
         (np.full((1, 6, 100), np.nan), {}, "no finite numbers; export it again, in float32"),
-        (QUERIES, {"names": "['a']"}, r"boxes \(1, 3, 4\), logits \(1, 3, 2\), and its metadata names 1"),
+        (NAS, {"names": ""}, r"boxes \(1, 84, 4\), scores \(1, 84, 9\); expected"),
+        (QUERIES, {"names": "['a']"}, r"boxes \(1, 3, 4\), logits \(1, 3, 2\); expected"),
         (boxes(), {"shape": (1, 1, 256, 320)}, r"its input is images \[1, 1, 256, 320\]"),
         (boxes(), {"shape": (1, 256, 320, 3)}, r"\[1, 256, 320, 3\].*channels first"),
         (boxes(), {"shape": (4, 3, 256, 320)}, "it takes 4 images at a time, expected one; export it with batch=1"),
@@ -181,6 +193,48 @@ def test_missing_and_damaged_files_are_refused_by_name(tmp_path) -> None:
     path = write_network(tmp_path / "half.onnx", boxes())
     path.write_bytes(path.read_bytes()[:200])
     with refuses(Code.CONFIG_INVALID, r"half\.onnx \(200 bytes\) is damaged or no ONNX file"):
+        NetworkDetector(NetworkConfig(model=str(path)))
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1", "is a pointer of Git LFS; get the file: git lfs pull"),
+        (b"PK\x03\x04" + bytes(100), "is a file of PyTorch or an archive; export it: yolo export"),
+        (b"", r"\(0 bytes\) is damaged or no ONNX file: No graph .*; export or copy it again"),
+        ((field(8, field(1, b"") + field(2, 17)), field(8, field(1, b"") + field(2, 99))), "newer ONNX .* opset=17"),
+        ((field(1, 8), field(1, 99)), "newer ONNX than onnxruntime .* reads; export it again with opset=17"),
+        (
+            (field(4, b"Identity"), field(4, b"NMS_TRTs")),
+            r"operators that onnxruntime lacks \(.*NMS_TRTs\); .* plugins",
+        ),
+    ],
+)
+def test_files_that_onnxruntime_does_not_read_are_refused_with_a_way_out(tmp_path, data, words: str) -> None:
+    path = write_network(tmp_path / "net.onnx", boxes())
+    path.write_bytes(data if isinstance(data, bytes) else path.read_bytes().replace(*data))
+    with refuses(Code.CONFIG_INVALID, words):
+        NetworkDetector(NetworkConfig(model=str(path)))
+
+
+def test_a_file_whose_weights_are_missing_names_them(tmp_path) -> None:
+    path = write_network(tmp_path / "net.onnx", boxes())
+    there = field(9, boxes().tobytes())
+    place = b"./" * 1188 + b"nets.data"  # as long as what it replaces
+    elsewhere = field(13, field(1, b"location") + field(2, place)) + field(14, 1)
+    assert len(elsewhere) == len(there)
+    path.write_bytes(path.read_bytes().replace(there, elsewhere))
+    with refuses(Code.CONFIG_INVALID, r"has its weights in .*, which is missing; copy it there"):
+        NetworkDetector(NetworkConfig(model=str(path)))
+
+
+@pytest.mark.parametrize("growing", [False, True])
+def test_a_network_that_never_ends_is_refused_in_bounded_time_and_memory(tmp_path, monkeypatch, growing: bool) -> None:
+    monkeypatch.setattr(network, "_MOST_SECONDS", 60.0 if growing else 0.5)
+    monkeypatch.setattr(network, "_MOST_BYTES", 2**28)
+    path = write_endless(tmp_path / "endless.onnx", growing=growing)
+    why = "it takes more memory" if growing else "it was stopped"
+    with refuses(Code.CONFIG_INVALID, f"320x256 image within .* s and 0.25 GiB: .*{why}.*; export it again, without"):
         NetworkDetector(NetworkConfig(model=str(path)))
 
 

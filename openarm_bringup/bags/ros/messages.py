@@ -7,12 +7,15 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 
 from openarm_bringup.bags.bag import Bag, Record, damaged
 from openarm_bringup.bags.storage import DAMAGE
 from openarm_bringup.messages import interface
 from openarm_common.errors import Code, OpenArmError
+
+#: Some writers fill up a message to a multiple of 4 bytes.
+_PADDING = 3
 
 
 def no_message(bag: Bag, record: Record) -> OpenArmError:
@@ -31,16 +34,24 @@ def message_of(bag: Bag, record: Record) -> Any:
         OpenArmError: INVALID_ARGUMENT, when its bytes are not of its type.
     """
     try:
-        return deserialize_message(record.data, interface(record.type))
+        message = deserialize_message(record.data, interface(record.type))
     except OpenArmError:
         raise
     # rclpy raises types of its own, and those of the middleware's parser
     except Exception as error:
-        if why := bag.why_not(record.topic):
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT, f"{bag.path}: {why}; read it with the version that made it"
-            ) from error
-        raise no_message(bag, record) from error
+        raise _changed(bag, record) or no_message(bag, record) from error
+    # bytes of other fields may make a message, too, but not all of them
+    changed = _changed(bag, record)
+    if changed and abs(len(serialize_message(message)) - len(record.data)) > _PADDING:
+        raise changed
+    return message
+
+
+def _changed(bag: Bag, record: Record) -> OpenArmError | None:
+    """Return the error of a record whose type has other fields than the installed one."""
+    why = bag.why_not(record.topic)
+    text = f"{bag.path}: {why}; read it with the version that made it"
+    return OpenArmError(Code.INVALID_ARGUMENT, text) if why else None
 
 
 def messages_of(bag: Bag, topics: Iterable[str]) -> dict[str, list[Any]]:
