@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from openarm_common.draws import until
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ServoModel
@@ -77,7 +78,7 @@ class Errors:
 def motions(arms: Mapping[str, Arm], home: Mapping[str, float], top_z: float, n: int) -> list[tuple[str, Trajectory]]:
     """Plan random motions of both arms in turn."""
     rng, state, found = np.random.default_rng(5), dict(home), list[tuple[str, Trajectory]]()
-    while len(found) < n:
+    for _ in until(lambda: len(found) >= n, "random motions", "move the table", 100 * n):
         side = SIDES[len(found) % 2]
         arm, sign = arms[side], 1.0 if side == "left" else -1.0
         tilt, heading, yaw = rng.uniform(0.0, 0.7), *rng.uniform(-np.pi, np.pi, 2)

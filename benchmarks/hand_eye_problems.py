@@ -19,6 +19,7 @@ from openarm_calibration.handeye.transforms import inverses, moved
 from openarm_calibration.handeye.unknowns import Noise
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.draws import until
 from openarm_common.types import Array
 
 INTRINSICS = Intrinsics(1280, 720, 900.0, 900.0, 640.0, 360.0)
@@ -70,7 +71,7 @@ def views(setup: Setup, count: int, rng: np.random.Generator) -> Array:
     """
     near, far = (0.30, 0.55) if setup == "in_hand" else (0.45, 0.75)
     out: list[Array] = []
-    while len(out) < count:
+    for _ in until(lambda: len(out) >= count, "views of the whole board", "take a smaller board", 1000 * count):
         tilt, around = math.radians(rng.uniform(5.0, 40.0)), rng.uniform(0.0, math.tau)
         direction = np.array([math.sin(tilt) * math.cos(around), math.sin(tilt) * math.sin(around), -math.cos(tilt)])
         eye = rng.uniform(near, far) * direction

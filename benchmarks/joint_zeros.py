@@ -30,6 +30,7 @@ from openarm_calibration.handeye.unknowns import Noise
 from openarm_calibration.handeye.zeros import ArmView, ZerosConfig, ZerosResult, solve_zeros
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, CameraConfig, load_cameras, true_mount
+from openarm_common.draws import until
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 
@@ -77,7 +78,8 @@ def postures(
     A = pose(middle)
     Z = A @ X @ seen if setup == "in_hand" else se3.inverse(A) @ X @ seen
     out: list[ArmView] = []
-    while len(out) < count:
+    what = f"views of {spec.name} of the whole board"
+    for _ in until(lambda: len(out) >= count, what, "take another mount", 10_000 * count):
         q = np.clip(middle + rng.uniform(-1.0, 1.0, len(names)) * rng.uniform(0.2, 0.9), lower, upper)
         error = rng.normal(0.0, 1.0, 6) * np.repeat((noise.translation, noise.rotation), 3)
         A = moved(pose(q), error)

@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.motion_map import rendered
 from openarm_common import se3
+from openarm_common.draws import until
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.folder import robot_work
 from openarm_common.types import Array
@@ -28,6 +29,7 @@ from openarm_motion.planning.planner import Planner, PlanQuery
 Collides = Callable[[Array], bool]
 
 _WORK = robot_work()
+_WAY_OUT = "take another seed, or a robot that reaches more"
 TABLE_TOP, _NEAR = _WORK.table.top_z, _WORK.region.x[0]
 _TRIES = 400
 #: Table-top problems to a rendered map.
@@ -103,7 +105,8 @@ def table_problems(arms: Sequence[Arm], home: Mapping[str, float], count: int, s
     """From a random free configuration to one of several next to a box that only the map knows; the arms take turns."""
     rng = np.random.default_rng(seed)
     out: list[Problem] = []
-    while len(out) < count:
+    what = f"problems {seed}: a free configuration and one next to a box"
+    for _ in until(lambda: len(out) >= count, what, _WAY_OUT, 100 * count):
         boxes = table_boxes(rng)
         known = rendered(arms[0], home, boxes, int(rng.integers(2**31)))
         for _ in range(min(_A_MAP, count - len(out))):
@@ -119,7 +122,8 @@ def shelf_problems(arms: Sequence[Arm], home: Mapping[str, float], count: int, s
     """From one cell of a shelf into another one; the arms take turns."""
     rng = np.random.default_rng(seed)
     out: list[Problem] = []
-    while len(out) < count:
+    what = f"problems {seed}: a free configuration in each of two cells"
+    for _ in until(lambda: len(out) >= count, what, _WAY_OUT, 100 * count):
         arm = arms[len(out) % len(arms)]
         boards, cells = shelf(rng)
         # the other arm is where it hangs clear of the shelf
@@ -136,7 +140,8 @@ def dual_problems(both: DualArm, home: Mapping[str, float], count: int, seed: in
     """Both arms from random configurations to boxes of their own."""
     rng = np.random.default_rng(seed)
     out: list[Problem] = []
-    while len(out) < count:
+    what = f"problems {seed}: free configurations of both arms"
+    for _ in until(lambda: len(out) >= count, what, _WAY_OUT, 100 * count):
         boxes = table_boxes(rng)
         scene = both.scene(home, boxes)
         ways: list[list[Array]] = []

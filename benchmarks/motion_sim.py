@@ -21,6 +21,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -34,6 +35,7 @@ from benchmarks.report import Row, write_report
 from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
+from openarm_common.draws import until
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
@@ -249,7 +251,8 @@ def main() -> None:
     ):
         seen: list[Seen] = []
         seed = args.first_seed
-        while len(seen) < count:
+        enough = partial(lambda seen, count: len(seen) >= count, seen, count)
+        for _ in until(enough, f"plans of {name}", "see why each is refused", 100 * count):
             if (name, seed) not in done:
                 found = run(arms, make, home, seed)
                 with args.runs.open("a", encoding="utf-8") as file:

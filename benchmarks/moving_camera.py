@@ -26,6 +26,7 @@ import numpy as np
 from benchmarks.localization import Studio, errors
 from benchmarks.report import Row, write_report
 from openarm_common.camera.stream import FrameStream
+from openarm_common.draws import until
 from openarm_common.robot.posture import PostureTracker
 from openarm_common.scene.scene import random_scene
 from openarm_common.types import Array
@@ -64,7 +65,8 @@ def measure(studio: Studio, speed: float, images: int, first_seed: int, latency:
     """Locate the object of `images` images that were taken at a speed, m/s, and arrived after `latency`, s."""
     camera, names = studio.cameras["wrist"], studio.description.arm_joints("right")
     out, seed = Errors(), first_seed
-    while len(out.suite) + out.refused < images:
+    what = "scenes that the wrist camera sees"
+    for _ in until(lambda: len(out.suite) + out.refused >= images, what, "move that camera", 100 * images):
         scene, rng = random_scene(seed, count=1), np.random.default_rng(seed)
         seed += 1
         item, at_image = scene.objects[0], studio.looking(rng)

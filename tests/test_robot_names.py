@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[1]
 WORDS = {
     "openarm_common/wanted.py": {"left", "right"},  # of a request
     "openarm_bringup/commands/pick.py": {"left", "right"},  # what remains; justification of a column
+    "openarm_bringup/workplace.py": {"overhead", "wrist", "spectator"},  # cameras that a draft is given
     "openarm_control/trajectory.py": {"right"},  # numpy.searchsorted
     "openarm_evaluation/campaign/trial.py": {"left"},  # what remains
     "openarm_motion/timing/trajectory.py": {"right"},

@@ -75,13 +75,15 @@ def new(
         mjcf: The maker's MJCF.
         urdf: The maker's URDF or xacro (`.xacro`), in place of an MJCF.
         arm: NAME=BASE_LINK:TIP_LINK of an arm: what it stands on, and its tool centre point; may be repeated.
-        edits: YAML of what the MJCF lacks: velocity limits, boxes, pads, frames; of a URDF, limits of joints.
+        edits: YAML of what the MJCF lacks: velocity limits, boxes, pads, frames; of a URDF, limits of joints and
+            where it stands.
         samples: Random states of the collision matrix.
         out: Folder in which the robot's folder is made; without one, `models/robots`.
         arg: NAME:=VALUE of an argument of the xacro; may be repeated.
         package: NAME=FOLDER of a package that `package://NAME` or `$(find NAME)` means, where it is neither above the
             file nor installed; may be repeated.
     """
+    from openarm_bringup.workplace import find_workplace
     from openarm_common.resources import models_dir
     from openarm_sim_bridge.drafting.check import folder_faults
     from openarm_sim_bridge.drafting.draft import draft_folder
@@ -95,10 +97,11 @@ def new(
     arguments = dict(_pair("--arg", text, ":=", "NAME:=VALUE") for text in arg)
     packages = {key: Path(at) for key, at in (_pair("--package", text, "=", "NAME=FOLDER") for text in package)}
     draft = draft_folder(folder, source, dict(map(_arm, arm)), edits, samples, arguments, packages)
+    remarks = [*draft.remarks, find_workplace(folder)]
     always = sorted(" and ".join(sorted(pair)) for pair, reason in draft.reasons.items() if reason == "Always")
     faults = folder_faults(folder)
-    data = {"folder": str(folder), "always_touching": always, "remarks": list(draft.remarks), "faults": faults}
-    lines = [f"note: {remark}" for remark in draft.remarks]
+    data = {"folder": str(folder), "always_touching": always, "remarks": remarks, "faults": faults}
+    lines = [f"note: {remark}" for remark in remarks]
     lines += [f"allowed, since they touch in every random state: {pair}" for pair in always]
     text = "\n".join([*lines, *(f"to do: {fault}" for fault in faults)])
     return Outcome(True, f"drafted {folder}: {len(faults)} to do", data=data, text=text)
@@ -120,6 +123,20 @@ def semantics(name: str) -> Outcome:
     text = "\n".join(f"allowed, since they touch in every random state: {pair}" for pair in always)
     what = ", ".join(f"{number} {reason}" for reason, number in count.items())
     return Outcome(True, f"wrote {path}: {what}", data={"path": str(path), "pairs": count}, text=text)
+
+
+@model.command
+def work(name: str) -> Outcome:
+    """Find where a robot grasps on its table; write that, and the cameras and postures that a draft lacks.
+
+    Args:
+        name: Of the robot, or the path of its folder.
+    """
+    from openarm_bringup.workplace import find_workplace
+
+    choose_robot(name)
+    message = find_workplace(robot_folder())
+    return Outcome(True, message, data={"work": message})
 
 
 @model.command

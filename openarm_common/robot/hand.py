@@ -105,7 +105,7 @@ class Hand:
     @cached_property
     def lever(self) -> float:
         """What a finger moves when the joint does, the mean up to where the hand is open: ±1 for a slide, m/rad."""
-        return self.parts.opening / (self.opened - self.closed)
+        return (self.parts.opening - self.finger(self.closed)) / (self.opened - self.closed)
 
     @property
     def opened(self) -> float:
@@ -114,8 +114,8 @@ class Hand:
 
     @property
     def closed(self) -> float:
-        """Position of the joint of a closed hand."""
-        return self.position(0.0)
+        """Position of the joint of a closed hand, whose pads meet or are as near to each other as they come."""
+        return self.sign * max(self.sign * self.position(0.0), self.parts.fingers[0][0])
 
 
 def _along(x: float, xs: Array, ys: Array) -> float:

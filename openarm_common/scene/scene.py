@@ -30,6 +30,7 @@ from pydantic import (
 
 from openarm_common import se3
 from openarm_common.config import Config, load_yaml, validate
+from openarm_common.draws import first_fit
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief
 from openarm_common.resources import is_file, models_dir
@@ -393,11 +394,21 @@ def random_scene(seed: int, count: int | None = None) -> Scene:
     number = int(rng.integers(1, 5)) if count is None else count
     colors = rng.permutation(list(PALETTE))[:number]
     spots: list[Array] = []
-    while len(spots) < number:
+
+    def draw() -> Array | None:
         side = rng.choice((-1.0, 1.0))
         spot = np.array([rng.uniform(*region.x), side * rng.uniform(*region.abs_y)]).round(4)
-        if all(np.hypot(*(spot - other)) >= SPACING for other in spots):
-            spots.append(spot)
+        return spot if all(np.hypot(*(spot - other)) >= SPACING for other in spots) else None
+
+    for k in range(number):
+        what = f"random scene {seed}: a place for object {k + 1} of {number}, {SPACING:g} m from the others"
+        try:
+            spots.append(first_fit(what, "take fewer objects, or enlarge work.region of robot.yaml", draw))
+        except OpenArmError:
+            if count is not None:
+                raise
+            colors = colors[:k]  # so many as there is room for
+            break
     objects: list[SceneObject] = []
     for color, spot in zip(colors, spots, strict=True):
         kind = str(rng.choice(("cube", "box", "cylinder", "can")))

@@ -25,6 +25,7 @@ from openarm_calibration.sampling.samples import SampleSet, SessionHead
 from openarm_calibration.store.store import CalibrationStore
 from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, load_cameras, uncertain_cameras
+from openarm_common.draws import first_fit
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.boards import Place
@@ -120,24 +121,28 @@ class Bench:
         """Take `count` samples.
 
         Raises:
-            OpenArmError: From the detector, when the board is hardly ever visible.
+            OpenArmError: From the detector, or INVALID_ARGUMENT, when the board is hardly ever visible.
         """
         lower, upper = self._description.limits(self.samples.joint_names, np.pi)
-        middle = self._middle()
-        missed = 0
-        while len(self.samples) < count:
+        middle, missed = self._middle(), list[OpenArmError]()
+
+        def draw() -> tuple[Matched, BoardDetection] | None:
             joints = self._joints(np.clip(middle + rng.uniform(-_SPREAD, _SPREAD, len(middle)), lower, upper))
             if not self._visible(joints) or not self._free(joints):
-                continue
+                return None
             try:
                 found = self._look()
-            except OpenArmError:
-                missed += 1
-                if missed > _MAX_MISSED:
+            except OpenArmError as error:
+                missed.append(error)
+                if len(missed) > _MAX_MISSED:
                     raise
-                continue
+                return None
             reported = {name: q + self._zeros.get(name, 0.0) for name, q in joints.items()}
-            self.samples.take(0, Matched(reported, 0, 0.0), found)
+            return Matched(reported, 0, 0.0), found
+
+        what = f"a posture that shows the board to camera {self._camera.name!r}"
+        for _ in range(count - len(self.samples)):
+            self.samples.take(0, *first_fit(what, "move that camera in cameras.yaml", draw, 10_000))
 
     def _look(self) -> BoardDetection:
         """What the camera finds in the posture that was last tried; raises as `detect`."""

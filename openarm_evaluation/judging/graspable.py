@@ -25,7 +25,7 @@ from openarm_common.robot.folder import robot_name
 from openarm_common.robot.work import Table
 from openarm_common.types import Array, Ints
 from openarm_motion.config import MotionConfig
-from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.workplace import reached
 from openarm_motion.service.motion_service import make_arms, table_box
 
 #: Aperture that is kept as room, m.
@@ -164,12 +164,17 @@ class GraspJudge:
                     sections += 1
                     seen.append(width)
                     for one in order if self._same_hand(arm, order[0]) else (arm,):
-                        if (reached := self._reached(self._arms[one], T)) is not None:
-                            return Graspable(True, "", one, width, abs(tilt), reached)
+                        if (pose := self._reached(one, T)) is not None:
+                            return Graspable(True, "", one, width, abs(tilt), pose)
         if sections:
             return Graspable(False, f"out of reach: no arm gets to any of {sections} grasps looked at", width=min(seen))
         widest = 1e3 * (self._hands[order[0]].pad[1, 1] * 2.0 - ROOM)
         return Graspable(False, f"no section that the hand can close on: none up to {widest:.0f} mm wide is free")
+
+    def _reached(self, arm: str, T: Array) -> Array | None:
+        """Return the pose with which an arm gets to a grasp, from where and to where it has to go; None: it can't."""
+        scene = self._arms[arm].scene(self._home, straight=True, gripper=self._arms[arm].opened)
+        return reached(self._arms[arm], scene, T, _BACK, _UP, _MARGIN)
 
     def _base_y(self, arm: str) -> float:
         return float(self._robot.link_poses(self._home)[self._robot.tcp_link(arm)][1, 3])
@@ -179,22 +184,6 @@ class GraspJudge:
         return one.boxes.shape == other.boxes.shape and bool(
             np.allclose(_mirrored(one.boxes), _mirrored(other.boxes), atol=2e-3)
         )
-
-    def _reached(self, arm: Arm, T: Array) -> Array | None:
-        """Return the pose with which an arm gets to a grasp, from where and to where it has to go; None: it can't."""
-        scene = arm.scene(self._home, straight=True, gripper=arm.opened)
-        for flip in (0.0, math.pi):
-            pose = T @ se3.make(se3.rot_z(flip)[:3, :3])
-            back, up = pose.copy(), pose.copy()
-            back[:3, 3] -= _BACK * pose[:3, 2]
-            up[2, 3] += _UP
-            for solution in arm.inverse.solutions(pose, _MARGIN):
-                if scene.collides(solution.q):
-                    continue
-                ways = [arm.inverse.follow(np.stack([pose, to]), solution, 0.0, math.pi) for to in (back, up)]
-                if all(reached == 2 and not scene.collides(path[1]) for path, reached, _ in ways):
-                    return pose
-        return None
 
 
 #: Judges by robot and table; making one takes a second.

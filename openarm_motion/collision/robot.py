@@ -8,6 +8,7 @@ found. m, rad.
 from __future__ import annotations
 
 import logging
+import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -51,7 +52,7 @@ class CollisionRobot:
     ) -> None:
         self.kinematics, self.apart = kinematics, apart
         self.arm = ArmLinks.of(description, kinematics)
-        self.model = pin.buildModelFromXML(description.urdf, True)
+        self.model = _model_of(description)
         self.geometry = pin.GeometryModel()
         self.links, self.solids = self._add_shapes(description)
         self.moving: tuple[int, ...] = tuple(i for i, link in enumerate(self.links) if link in self.arm.moving)
@@ -203,3 +204,23 @@ def _half_diagonal(shape: coal.CollisionGeometry) -> float:
     shape.computeLocalAABB()
     box = shape.aabb_local
     return 0.5 * float(np.linalg.norm(np.asarray(box.max_) - np.asarray(box.min_)))
+
+
+def _model_of(description: RobotDescription) -> pin.Model:
+    """Model whose joints come after those that they follow, as pinocchio asks, which goes by their names otherwise."""
+    order: dict[str, str] = {}
+    for name in sorted(description.joints):
+        leader = description.joints[name].mimic
+        before = [] if leader is None else [joint.name for joint in description.chain(description.joints[leader].child)]
+        for one in (*before, name):
+            order.setdefault(one, f"{len(order):06d} {one}")
+    root = ET.fromstring(description.urdf)
+    for joint in root.findall("joint"):
+        joint.set("name", order[joint.get("name", "")])
+        for mimic in joint.findall("mimic"):
+            mimic.set("joint", order[mimic.get("joint", "")])
+    model = pin.buildModelFromXML(ET.tostring(root, encoding="unicode"), True)
+    names = {numbered: name for name, numbered in order.items()}
+    for i, name in enumerate(model.names):
+        model.names[i] = names.get(name, name)
+    return model

@@ -23,7 +23,7 @@ from openarm_sim_bridge.drafting.mesh_files import MOST, is_binary_stl, simplifi
 _PARTS = ("link", "joint", "material", "mujoco")
 _TAGS = ("visual", "collision")
 #: What edits can say of a URDF.
-_LIMITS = ("range", "velocity", "effort")
+_OF_URDF = ("range", "velocity", "effort", "base", "stand", "turn")
 #: Colour of what has a texture.
 _GREY = "0.5 0.5 0.5 1"
 
@@ -37,7 +37,7 @@ class AdoptedUrdf:
     Args:
         source: URDF, or xacro.
         folder: Of the draft.
-        edits: Limits of joints.
+        edits: Limits of joints; where the robot stands is added by the draft.
         arguments: Of xacro, by name.
         packages: Folders of packages by name.
 
@@ -49,8 +49,8 @@ class AdoptedUrdf:
     def __init__(
         self, source: Path, folder: Path, edits: Edits, arguments: Mapping[str, str], packages: Mapping[str, Path]
     ) -> None:
-        if other := sorted(edits.model_fields_set - set(_LIMITS)):
-            text = f"edits {', '.join(other)} are of an MJCF; those of a URDF are {', '.join(_LIMITS)}"
+        if other := sorted(edits.model_fields_set - set(_OF_URDF)):
+            text = f"edits {', '.join(other)} are of an MJCF; those of a URDF are {', '.join(_OF_URDF)}"
             raise OpenArmError(Code.INVALID_ARGUMENT, text)
         self._source, self._folder, self._packages = source, folder, packages
         self._copies: dict[tuple[Path, tuple[float, ...]], tuple[str, ...]] = {}

@@ -7,6 +7,7 @@ import itertools
 import math
 import shutil
 import tempfile
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,17 +22,20 @@ from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Joint, RobotDescription
 from openarm_common.types import Array
+from openarm_sim_bridge.drafting.additions import add_hands, add_stand, drives, fix_undriven
 from openarm_sim_bridge.drafting.adopted import AdoptedUrdf
 from openarm_sim_bridge.drafting.collisions import LinkContacts, adjacent_pairs
 from openarm_sim_bridge.drafting.edits import Edits
 from openarm_sim_bridge.drafting.mjcf import UrdfDraft, compiled
 from openarm_sim_bridge.drafting.semantics import SOURCE, write_srdf
 
-_HEAD = """# SPDX-License-Identifier: Apache-2.0
-# Drafted by `openarm model new` from {source}: review it, then ask `openarm model check`.
+_LICENSED = "# SPDX-License-Identifier: Apache-2.0\n"
+_HEAD = f"""{_LICENSED}# Drafted by `openarm model new` from {{source}}: review it, then ask `openarm model check`.
 """
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 _NOWHERE: Mapping[str, Path] = MappingProxyType({})
+#: Lowest table that a robot can work at, and how high it stands whose arms are lower, m.
+_LOWEST_TABLE, _STAND = 0.05, 0.45
 _LICENCE = "<!-- SPDX-License-Identifier: Apache-2.0 -->\n"
 
 
@@ -120,7 +124,7 @@ def _drafted(
             raise OpenArmError(Code.CONFIG_INVALID, text)
         draft = UrdfDraft(name, compiled(source, wanted), wanted, shared)
         draft.meshes.write(folder, wanted.triangles, wanted.detail)
-        urdf.write_text(draft.text().replace("\n", f"\n{_LICENCE}", 1), encoding="utf-8")
+        urdf.write_text(draft.text(), encoding="utf-8")
     else:
         adopted = AdoptedUrdf(source, folder, wanted, arguments, packages)
         remarks += adopted.remarks
@@ -131,12 +135,24 @@ def _drafted(
         parts[arm], guesses = arm_parts(robot, arm, base, tip)
         remarks += guesses
     base = wanted.base if source.suffix == ".xml" else robot.root
+    root = ET.fromstring(urdf.read_text(encoding="utf-8"))
+    if source.suffix != ".xml" and (stand := _stand(robot, parts, wanted)) is not None:
+        base = wanted.base if "base" in wanted.model_fields_set else f"{name}_stand"
+        add_stand(root, robot, base, stand, wanted.turn)
+        if "stand" not in wanted.model_fields_set:
+            what = f"{robot.root!r} stands on {base!r}, {stand[2]:g} m high, as the table"
+            remarks.append(f"{what}; `stand: [X, Y, Z]` in --edits of a new draft changes that")
+    remarks += fix_undriven(root, robot, parts)
+    hand, notes = add_hands(root, robot, parts)
+    _write_urdf(urdf, root, licensed=source.suffix == ".xml")
+    robot = RobotDescription.from_files(urdf)
     signs = mirror_signs(robot, [part["joints"] for part in parts.values()])
-    content = {"urdf": urdf.name, "srdf": f"{name}.srdf", "base": base, "arms": parts, "mirror": signs}
-    _write_yaml(folder / "robot.yaml", source, content)
+    content = {"urdf": urdf.name, "srdf": f"{name}.srdf", "base": base, **hand, **drives(robot, parts), "arms": parts}
+    head = _HEAD.format(source=source.name)
+    write_yaml(folder / "robot.yaml", content | {"mirror": signs}, head)
     if not (folder / SOURCE).exists():
-        _write_yaml(folder / SOURCE, source, _first_semantics(robot, parts) | {"samples": samples})
-    return Draft(write_srdf(folder)[1], tuple(remarks))
+        write_yaml(folder / SOURCE, _first_semantics(robot, parts) | {"samples": samples}, head)
+    return Draft(write_srdf(folder)[1], tuple(remarks + notes))
 
 
 def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -292,6 +308,30 @@ def _gap(robot: RobotDescription, arm: Mapping[str, Any], position: float) -> fl
     return float(np.mean([np.linalg.norm(a - b) for a, b in itertools.combinations(middles, 2)]))
 
 
-def _write_yaml(path: Path, source: Path, content: Mapping[str, Any]) -> None:
-    text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)
-    path.write_text(_HEAD.format(source=source.name) + text, encoding="utf-8")
+def _stand(
+    robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]], edits: Edits
+) -> tuple[float, float, float] | None:
+    """Place of a URDF's root over the floor: as the edits say, or on a stand, where arms are lower than tables."""
+    if "stand" in edits.model_fields_set:
+        return edits.stand
+    poses = robot.link_poses(dict.fromkeys(robot.joints, 0.0))
+    lowest = min(float(poses[arm["base"]][2, 3]) for arm in parts.values())
+    return None if lowest >= _LOWEST_TABLE else (0.0, 0.0, _STAND)
+
+
+def _write_urdf(path: Path, root: ET.Element, *, licensed: bool) -> None:
+    ET.indent(root)
+    head = f'<?xml version="1.0"?>\n{_LICENCE}' if licensed else ""
+    path.write_text(head + ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+
+
+def write_yaml(path: Path, content: Mapping[str, Any], head: str = "") -> None:
+    """Write a YAML file below the lines of comment that it begins with, or those of `head`."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
+    head = head or "".join(itertools.takewhile(lambda line: line.startswith("#"), lines)) or _LICENSED
+    path.write_text(head + yaml_text(content), encoding="utf-8")
+
+
+def yaml_text(content: Mapping[str, Any]) -> str:
+    """Return YAML as files of robots have it: numbers in rows, no aliases."""
+    return yaml.dump(dict(content), Dumper=_Dumper, sort_keys=False, width=120, default_flow_style=None)

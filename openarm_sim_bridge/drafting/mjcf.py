@@ -26,7 +26,8 @@ from openarm_sim_bridge.drafting.edits import BoxEdit, Edits, FrameEdit, matches
 from openarm_sim_bridge.drafting.mesh_files import MeshFiles
 
 _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
-_ROOT = "world"
+#: Root link of a draft.
+WORLD = "world"
 _TAGS = ("visual", "collision")
 _UNCHANGED = Edits()
 #: A MuJoCo camera looks along -z with y up, an optical frame along z with y down.
@@ -98,7 +99,7 @@ class UrdfDraft:
         self._refuse()
         self.meshes = MeshFiles(model, shared)
         self._root = ET.Element("robot", name=name)
-        ET.SubElement(self._root, "link", name=_ROOT)
+        ET.SubElement(self._root, "link", name=WORLD)
         self._build()
 
     def text(self) -> str:
@@ -156,9 +157,9 @@ class UrdfDraft:
                 self._shapes(link, body)
             for box in self._edits.add.get(name, ()):
                 T = se3.make(None, box.xyz)
-                _shape(link, "collision", f"{name}_{box.name}_collision", T, "box", size=_numbers(box.size))
+                shape_element(link, "collision", f"{name}_{box.name}_collision", T, "box", size=_numbers(box.size))
             if body == 0:
-                self._fixed(f"{name}_fixed", _ROOT, name, np.eye(4))
+                self._fixed(f"{name}_fixed", WORLD, name, np.eye(4))
                 continue
             parent = int(model.body_parentid[body])
             T = se3.make(_rotation(model.body_quat[body]), model.body_pos[body])
@@ -205,7 +206,7 @@ class UrdfDraft:
         for tag in ("visual", "collision"):
             for box in boxes:
                 name = f"{link.get('name')}_{box.name}_{tag}"
-                element = _shape(link, tag, name, se3.make(None, box.xyz), "box", size=_numbers(box.size))
+                element = shape_element(link, tag, name, se3.make(None, box.xyz), "box", size=_numbers(box.size))
                 if tag == "visual" and box.material:
                     self._colour(element, box.material, self._edits.materials.get(box.material, (0.5, 0.5, 0.5, 1.0)))
 
@@ -223,7 +224,7 @@ class UrdfDraft:
                     edit = self._edits.replace[name]
                     if edit is None:
                         continue
-                    _shape(link, tag, edit.name, se3.make(None, edit.xyz), "box", size=_numbers(edit.size))
+                    shape_element(link, tag, edit.name, se3.make(None, edit.xyz), "box", size=_numbers(edit.size))
                     continue
                 for element in self._geom(link, tag, name, geom, body):
                     if tag == "visual":
@@ -244,12 +245,12 @@ class UrdfDraft:
             size = {"filename": mesh.file}
             if (mesh.signs < 0.0).any():
                 size["scale"] = _numbers(mesh.signs)
-            return [_shape(link, tag, name, T, "mesh", **size)]
+            return [shape_element(link, tag, name, T, "mesh", **size)]
         if kind == _GEOM.mjGEOM_BOX:
-            return [_shape(link, tag, name, T, "box", size=_numbers([a, b, c]))]
+            return [shape_element(link, tag, name, T, "box", size=_numbers([a, b, c]))]
         radius, length = _numbers([0.5 * a]), _numbers([b])
         if kind == _GEOM.mjGEOM_SPHERE:
-            return [_shape(link, tag, name, T, "sphere", radius=radius)]
+            return [shape_element(link, tag, name, T, "sphere", radius=radius)]
         if kind not in (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_CAPSULE):
             if kind == _GEOM.mjGEOM_PLANE:
                 return []  # the floor is no part of a robot
@@ -257,10 +258,12 @@ class UrdfDraft:
                 f"geom {name!r} is of type {_GEOM(kind).name.removeprefix('mjGEOM_').lower()}, which a URDF cannot have"
             )
             raise OpenArmError(Code.CONFIG_INVALID, text)
-        out = [_shape(link, tag, name, T, "cylinder", radius=radius, length=length)]
+        out = [shape_element(link, tag, name, T, "cylinder", radius=radius, length=length)]
         for end in (-0.5 * b, 0.5 * b) if kind == _GEOM.mjGEOM_CAPSULE else ():
             ball = T @ se3.make(None, (0.0, 0.0, end))
-            out.append(_shape(link, tag, f"{name}_{'top' if end > 0 else 'bottom'}", ball, "sphere", radius=radius))
+            out.append(
+                shape_element(link, tag, f"{name}_{'top' if end > 0 else 'bottom'}", ball, "sphere", radius=radius)
+            )
         return out
 
     def _colour(self, element: ET.Element, name: str, rgba: ArrayLike) -> None:
@@ -291,7 +294,12 @@ class UrdfDraft:
             ET.SubElement(element, "mimic", numbers)
 
     def _fixed(self, name: str, parent: str, child: str, T: Array) -> None:
-        _joint_element(self._root, name, "fixed", parent, child, T)
+        fixed_joint(self._root, name, parent, child, T)
+
+
+def fixed_joint(root: ET.Element, name: str, parent: str, child: str, T: Array) -> None:
+    """Add a fixed joint to a URDF; `T` (4, 4): of the child in the parent."""
+    _joint_element(root, name, "fixed", parent, child, T)
 
 
 def _joint_name(model: mujoco.MjModel, k: int) -> str:
@@ -333,20 +341,22 @@ def _mimics(model: mujoco.MjModel) -> dict[str, tuple[str, float, float]]:
 
 def _joint_element(root: ET.Element, name: str, kind: str, parent: str, child: str, T: Array) -> ET.Element:
     element = ET.SubElement(root, "joint", name=name, type=kind)
-    _origin(element, T)
+    set_origin(element, T)
     ET.SubElement(element, "parent", link=parent)
     ET.SubElement(element, "child", link=child)
     return element
 
 
-def _shape(link: ET.Element, tag: str, name: str, T: Array, kind: str, **size: str) -> ET.Element:
+def shape_element(link: ET.Element, tag: str, name: str, T: Array, kind: str, **size: str) -> ET.Element:
+    """Add a visual or a collision shape to a link, `T` (4, 4) in it, with the attributes of its kind."""
     element = ET.SubElement(link, tag, name=name)
-    _origin(element, T)
+    set_origin(element, T)
     ET.SubElement(ET.SubElement(element, "geometry"), kind, size)
     return element
 
 
-def _origin(element: ET.Element, T: Array) -> None:
+def set_origin(element: ET.Element, T: Array) -> None:
+    """Give a joint or shape its place, (4, 4) in its parent."""
     ET.SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(se3.rpy_from_matrix(T[:3, :3])))
 
 

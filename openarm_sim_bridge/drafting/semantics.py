@@ -17,7 +17,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from openarm_common.config import Config, load_config
+from openarm_common.config import Config, load_config, read_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import read_folder
@@ -85,6 +85,19 @@ def write_srdf(folder: Path, out: Path | None = None) -> tuple[Path, dict[Pair, 
     target = out or folder / parts.srdf
     target.write_text(srdf_text(description, source, reasons), encoding="utf-8")
     return target, reasons
+
+
+def rewrite_states(folder: Path) -> None:
+    """Write the SRDF of a robot's folder with other postures and the collision matrix that it has.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when a file of the folder is faulty.
+    """
+    parts, source = read_folder(folder), read_source(folder)
+    description = RobotDescription.from_files(folder / parts.urdf).of_folder(folder.name, parts)
+    old = ET.fromstring(read_text(folder / parts.srdf)).findall("disable_collisions")
+    reasons = {frozenset((pair.get("link1", ""), pair.get("link2", ""))): pair.get("reason", "") for pair in old}
+    (folder / parts.srdf).write_text(srdf_text(description, source, reasons), encoding="utf-8")
 
 
 def classify(description: RobotDescription, source: SemanticsSource) -> dict[Pair, str]:

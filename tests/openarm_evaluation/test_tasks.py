@@ -62,7 +62,7 @@ def test_an_object_to_push_is_drawn_where_it_has_always_been():
     """Before what an arm can grasp is left out, which takes plans."""
 
     def first(seed: int) -> str:
-        return two_arms._one_object(seed, np.random.default_rng([seed, 5])).model_dump_json()
+        return two_arms._one_object(seed, np.random.default_rng([seed, 5]), 0.0).model_dump_json()
 
     assert {*KNOWN, "push", *THINGS} == set(SUITES)
     assert digest(first, 21) == "8b0596d64ece80df"

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from openarm_common import se3
@@ -259,3 +261,18 @@ def test_meshes_are_refused_with_the_link(six: RobotDescription) -> None:
     text = six.urdf.replace('<box size="0.06 0.06 0.06"/>', '<mesh filename="package://arm/waist.stl"/>', 1)
     robot = RobotDescription.from_urdf(text)
     refused("'waist_link' has meshes", CollisionRobot, robot, ArmKinematics(robot, "tool"))
+
+
+def test_a_follower_may_come_before_its_leader_by_name() -> None:
+    description = RobotDescription.load("ur5e")
+    renamed = description.urdf.replace("robotiq_left_driver_joint", "z_driver_joint")
+    other = replace(RobotDescription.from_urdf(renamed, ""), links=description.links)
+    kinematics = [ArmKinematics(robot, "ur5e_tcp") for robot in (description, other)]
+    (one, two) = (CollisionRobot(robot, k) for robot, k in zip((description, other), kinematics, strict=True))
+    poses = []
+    for robot, leader in ((one, "robotiq_left_driver_joint"), (two, "z_driver_joint")):
+        data = robot.model.createData()
+        pin.forwardKinematics(robot.model, data, robot.configuration({leader: 0.4}))
+        names = ("robotiq_right_follower_joint", "robotiq_left_spring_link_joint")
+        poses.append([data.oMi[robot.model.getJointId(name)].homogeneous for name in names])
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-12)

@@ -92,7 +92,7 @@ def test_a_package_is_found_above_the_file_and_the_draft_needs_it_no_longer(tmp_
     upper = RobotDescription.from_files(elsewhere / "mine.urdf").links["upper"]
     np.testing.assert_allclose([shape.size for shape in upper.collision], [(0.03, 0.02, 0.1), (0.06, 0.02, 0.1)])
     assert folder_faults(elsewhere) == []
-    assert draft.remarks == ()
+    assert told(draft) == ()
 
 
 def test_a_package_is_where_an_option_or_the_environment_says(tmp_path, monkeypatch):
@@ -116,6 +116,16 @@ def test_a_path_of_another_machine_s_installed_package_is_that_of_the_package(tm
     assert folder_faults(folder) == []
     words = "there is no mesh /home/maker/m.stl; name it from the folder of this file, or by package://NAME/PATH"
     refused(words, drafted, tmp_path / "2", robot(mesh("file:///home/maker/m.stl")))
+
+
+NO_HAND = "arms.arm: no two fingers that come together, so robot.yaml has no `hand`; write it as docs/extending.md says"
+
+
+def told(draft: Draft) -> tuple[str, ...]:
+    """What a draft says of the maker's description, but that the robot stands on a column."""
+    first = [remark for remark in draft.remarks if remark.startswith("'base' stands on 'mine_stand', 0.45 m high")]
+    assert len(first) == 1
+    return tuple(remark for remark in draft.remarks if remark not in first)
 
 
 XACRO = (
@@ -254,8 +264,14 @@ def test_settings_of_mujoco_textures_and_parts_of_other_programs_are_no_hindranc
 def test_a_branch_that_is_fixed_to_nothing_is_left_out_and_one_that_moves_is_refused(tmp_path):
     branch = link("logo") + link("screw") + joint("s", "{}", "logo", "screw") + joint("l", "fixed", "head", "logo")
     folder, draft = drafted(tmp_path, robot(more=branch.format("fixed")))
-    assert draft.remarks == ("left out logo, screw: joint 'l' fixes it to 'head', which the file does not have",)
-    assert list(RobotDescription.from_files(folder / "mine.urdf").links) == ["base", "upper", "tip"]
+    assert told(draft) == ("left out logo, screw: joint 'l' fixes it to 'head', which the file does not have",)
+    assert list(RobotDescription.from_files(folder / "mine.urdf").links) == [
+        "base",
+        "upper",
+        "tip",
+        "world",
+        "mine_stand",
+    ]
     moving = link("head") + joint("h", "revolute", "neck", "head")
     refused("joint 'h' has the parent link 'neck', which does not exist", drafted, tmp_path / "2", robot(more=moving))
 
@@ -264,10 +280,8 @@ def test_limits_that_a_urdf_lacks_are_given_for_all_joints_at_once(tmp_path):
     text = robot(more=link("end") + joint("wrist", "continuous", "tip", "end"))
     text = text.replace('effort="5" velocity="2"', 'effort="0"', 1).replace('effort="5" velocity="2"', "")
     (velocity, effort) = folder_faults(drafted(tmp_path, text)[0])
-    assert velocity.startswith(
-        "joints without a limit of velocity > 0: shoulder (0), wrist (0); give it for all of them"
-    )
-    assert effort.startswith("joints without a limit of effort > 0: shoulder (0), wrist (0); give it for all of them")
+    assert velocity.startswith("joints without a limit of velocity > 0: shoulder (0); give it for all of them")
+    assert effort.startswith("joints without a limit of effort > 0: shoulder (0); give it for all of them")
     edits = tmp_path / "edits.yaml"
     edits.write_text('velocity: {"*": 1.5}\neffort: {shoulder: 7, "*": 3}\nrange: {"s*": [-0.5, 0.25]}\n')
     folder, _ = drafted(tmp_path / "again", text, edits=edits)
@@ -305,7 +319,7 @@ def hand(tmp_path: Path, more: str) -> tuple[dict[str, object], dict[str, object
     arm = yaml.safe_load((folder / "robot.yaml").read_text())["arms"]["arm"]
     text = (folder / "semantics.yaml").read_text()
     assert "inf" not in text
-    return arm, yaml.safe_load(text)["gripper"], draft.remarks
+    return arm, yaml.safe_load(text)["gripper"], told(draft)
 
 
 def pads(*names: str) -> str:
@@ -322,8 +336,9 @@ def test_fingers_are_what_slides_together_and_not_a_propeller_before_them(tmp_pa
     arm, gripper, remarks = hand(tmp_path, more)
     assert (arm["finger_joint"], arm["fingers"]) == ("left", ["l", "r"])
     assert gripper == {"open": {"arm": 0.05}, "closed": {"arm": 0.02}}
-    (remark,) = remarks
-    assert remark.startswith("arms.arm: finger_joint 'left' is a guess; further joints of the hand: motor; ")
+    guess, fixed, _ = remarks
+    assert guess.startswith("arms.arm: finger_joint 'left' is a guess; further joints of the hand: motor; ")
+    assert fixed == "fixed at 0, since no arm and no hand drives them: motor"
 
 
 def test_of_a_linkage_the_fingers_are_its_ends_and_closed_is_where_they_meet(tmp_path):
@@ -341,13 +356,14 @@ def test_of_a_linkage_the_fingers_are_its_ends_and_closed_is_where_they_meet(tmp
     arm, gripper, remarks = hand(tmp_path, side("l", -0.05, 1) + side("r", 0.05, -1))
     assert (arm["finger_joint"], arm["fingers"]) == ("l_bar", ["l_pad", "r_pad"])
     assert gripper == {"open": {"arm": 0.0}, "closed": {"arm": 0.2}}
-    assert remarks == ()
+    assert remarks == (NO_HAND,)
 
 
 def test_one_jaw_and_a_hand_of_many_joints_are_said(tmp_path):
     arm, _, remarks = hand(tmp_path / "1", pads("jaw") + joint("grip", "revolute", "upper", "jaw"))
     assert (arm["finger_joint"], arm["fingers"]) == ("grip", ["jaw"])
-    (remark,) = remarks
+    remark, no_hand = remarks
+    assert no_hand == NO_HAND
     assert remark.startswith("arms.arm: 'grip' moves one finger, 'jaw'; where the other is a part of 'upper', add that")
     many = "".join(link(f"f{k}") + joint(f"j{k}", "revolute", "upper", f"f{k}") for k in range(4))
     arm, _, remarks = hand(tmp_path / "2", many)
@@ -404,5 +420,8 @@ def test_the_command_takes_arguments_packages_and_says_what_is_left(tmp_path):
     refused("--package 'parts': expected NAME=FOLDER", new, "mine", **more, package=("parts",))
     done = new("mine", **more, arg=("who:=me",), package=(f"parts={tmp_path}",))
     assert done.data is not None
-    assert (done.data["remarks"], done.data["faults"]) == ([], [])
+    stands, work = done.data["remarks"]
+    assert stands.startswith("'base' stands on 'mine_stand'")
+    assert work == f"work: needs `hand` in robot.yaml, then `openarm model work {tmp_path / 'robots' / 'mine'}`"
+    assert done.data["faults"] == []
     assert isinstance(mujoco.MjModel.from_xml_path(str(tmp_path / "robots" / "mine" / "mine.urdf")), mujoco.MjModel)

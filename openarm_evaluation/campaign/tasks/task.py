@@ -6,6 +6,7 @@ Positions are in the base frame, m; the same set and seed always give the same t
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from openarm_common.draws import first_fit
 from openarm_common.errors import Code
 from openarm_common.scene.scene import PALETTE, SPACING, Scene, random_scene
 
@@ -108,15 +110,20 @@ def clutter(seed: int) -> Task:
 
 def crowded_scene(seed: int, count: int) -> Scene:
     """Make a random scene with more objects than colours: colours are used again."""
-    whole = random_scene(seed, count=min(count, len(PALETTE)))
-    objects, k = list(whole.objects), 0
-    while len(objects) < count:
-        k += 1
-        for twin in random_scene(seed + k * 1_000_000, count=len(PALETTE)).objects:
+    whole, k = random_scene(seed, count=min(count, len(PALETTE))), itertools.count(1)
+    objects = list(whole.objects)
+
+    def draw() -> Scene | None:
+        if len(objects) == count:
+            return whole.model_copy(update={"objects": tuple(objects), "name": f"crowded_{seed}"})
+        number = next(k)
+        for twin in random_scene(seed + number * 1_000_000, count=len(PALETTE)).objects:
             far = all(math.dist(twin.position[:2], item.position[:2]) >= SPACING for item in objects)
             if len(objects) < count and far:
-                objects.append(twin.model_copy(update={"name": f"{twin.name}_{k + 1}"}))
-    return whole.model_copy(update={"objects": tuple(objects), "name": f"crowded_{seed}"})
+                objects.append(twin.model_copy(update={"name": f"{twin.name}_{number + 1}"}))
+        return None
+
+    return first_fit(f"scene {seed}: {count} objects {SPACING:g} m apart", "enlarge work.region of robot.yaml", draw)
 
 
 def endurance(seed: int) -> Task:

@@ -6,6 +6,7 @@ Base frame, m; all is drawn from the seed. `Task.route` is the route by which th
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from openarm_common import se3
 from openarm_common.detection import Detection
+from openarm_common.draws import first_fit
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
@@ -33,6 +35,11 @@ _ASIDE = 0.20
 _BESIDE = 0.10
 #: Between the middles of a place and any object, m.
 _APART = 0.13
+#: Draws of a scene for a push; so many of them each so much farther off than those before, m.
+_PUSHES, _NEAR, _FARTHER = 200, 10, 0.02
+#: Least distance of its middle from the far edge of the table, m.
+_FAR_EDGE = 0.06
+_REGION = "work.region of robot.yaml"
 
 
 def handover_task(seed: int) -> Task:
@@ -40,32 +47,38 @@ def handover_task(seed: int) -> Task:
     rng, region = np.random.default_rng([seed, 4]), robot_work().region
     aside, beside = (round(region.abs_y[0] + distance, 3) for distance in (_ASIDE, _BESIDE))
     xs, ys = within(region.x, 0.02, 0.02), (aside, within(region.abs_y, 0.0, 0.02)[1])
-    while True:
+
+    def draw() -> Task | None:
         scene = random_scene(int(rng.integers(1 << 31)), count=int(rng.integers(1, 4)))
         first = scene.objects[0]
         others = [np.array(item.position[:2]) for item in scene.objects[1:]]
         if abs(first.position[1]) < aside or any(abs(p[1]) < beside for p in others):
-            continue
+            return None
         side = -np.sign(first.position[1])
         place = np.array([rng.uniform(*xs), side * rng.uniform(*ys)]).round(3)
-        if all(np.linalg.norm(place - p) >= _APART for p in others):
-            break
-    named = scene.model_copy(update={"name": f"handover_{seed}"})
-    xy = (float(place[0]), float(place[1]))
-    return Task("handover", seed, named, (first.label,), kind="handover", place=xy, route="hand_over")
+        if any(np.linalg.norm(place - p) < _APART for p in others):
+            return None
+        named, xy = scene.model_copy(update={"name": f"handover_{seed}"}), (float(place[0]), float(place[1]))
+        return Task("handover", seed, named, (first.label,), kind="handover", place=xy, route="hand_over")
+
+    what = f"handover {seed}: an object on one side and its place on the other, |y| from {aside:g} m on"
+    return first_fit(what, f"enlarge {_REGION}", draw)
 
 
 def pair_task(seed: int) -> Task:
     """Request two objects simultaneously, one for each arm; up to two others around."""
     rng = np.random.default_rng([seed, 6])
-    while True:
+
+    def draw() -> Task | None:
         scene = random_scene(int(rng.integers(1 << 31)), count=int(rng.integers(2, 5)))
         left = [item for item in scene.objects if item.position[1] > 0.0]
         right = [item for item in scene.objects if item.position[1] < 0.0]
-        if left and right:
-            break
-    named = scene.model_copy(update={"name": f"pair_{seed}"})
-    return Task("pairs", seed, named, (left[0].label, right[0].label), kind="pair", together=True)
+        if not (left and right):
+            return None
+        named = scene.model_copy(update={"name": f"pair_{seed}"})
+        return Task("pairs", seed, named, (left[0].label, right[0].label), kind="pair", together=True)
+
+    return first_fit(f"pairs {seed}: an object on either side", f"enlarge {_REGION}", draw)
 
 
 def in_turn_task(seed: int) -> Task:
@@ -74,18 +87,28 @@ def in_turn_task(seed: int) -> Task:
 
 
 def push_task(seed: int) -> Task:
-    """Request an object between the arms, turned so that neither can grasp it where it is."""
-    rng = np.random.default_rng([seed, 5])
-    while True:
-        scene = _one_object(seed, rng)
-        if not any(_graspable(scene, arm) for arm in RobotDescription.load().arm_names):
-            return Task("push", seed, scene, (scene.objects[0].label,), kind="push", route="push")
+    """Request an object between the arms, turned so that neither can grasp it where it is.
+
+    Where arms grasp all that stands next to their region, it stands farther off.
+    """
+    rng, arms, number = np.random.default_rng([seed, 5]), RobotDescription.load().arm_names, itertools.count()
+
+    def draw() -> Task | None:
+        scene = _one_object(seed, rng, _FARTHER * (next(number) // _NEAR))
+        if any(_graspable(scene, arm) for arm in arms):
+            return None
+        return Task("push", seed, scene, (scene.objects[0].label,), kind="push", route="push")
+
+    begin = robot_work().region.x[1]
+    what = f"push {seed}: a box of 40 to 70 mm between the arms, x from {begin:g} m on, that neither can grasp"
+    return first_fit(what, f"enlarge {_REGION} to all that the arms grasp, or its table", draw, _PUSHES)
 
 
-def _one_object(seed: int, rng: np.random.Generator) -> Scene:
-    """Draw an object that no arm can grasp but a hand can push: past the region, between the arms."""
-    region = robot_work().region
-    xs, half = past(region.x, 0.01, 0.07), region.abs_y[0] / 2.0
+def _one_object(seed: int, rng: np.random.Generator, farther: float) -> Scene:
+    """Draw an object for `push_task`: past the region and so much farther, between the arms."""
+    region, far = robot_work().region, within(robot_work().table.x, 0.0, _FAR_EDGE)[1]
+    low, high = past(region.x, 0.01 + farther, 0.07 + farther)
+    xs, half = (min(low, far), min(high, far)), region.abs_y[0] / 2.0
     color = str(rng.choice(list(PALETTE)))
     a, b, c = (round(float(edge), 3) for edge in rng.uniform((0.04, 0.04, 0.04), (0.07, 0.07, 0.06)))
     item = SceneObject(
