@@ -94,8 +94,8 @@ def judged(run: CalibrationRun, name: str, seed: int, added: Mapping[str, float]
 
     Args:
         run: That ended well.
-        name: Of the camera.
-        seed: Of the true mounts.
+        name: Name of the camera.
+        seed: Seed of the true mounts.
         added: To true positions of joints, in what they report, rad.
     """
     found, camera = run.found, load_cameras()[name]
@@ -128,7 +128,7 @@ def hand(found: ZerosCalibration, samples: SampleSet, true: Array, added: Mappin
 
     Args:
         found: Zeros and mounts in use.
-        samples: Of one camera and arm; its postures.
+        samples: Samples of one camera and arm; its postures.
         true: (4, 4) mount of the optical frame.
         added: To true positions of joints, in what they report, rad.
     """

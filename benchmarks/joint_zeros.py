@@ -58,7 +58,7 @@ def postures(
         rng: Of everything random.
         zeros: Offsets by joint, rad.
         noise: Standard deviations.
-        mount_seed: Of the true mount of the camera.
+        mount_seed: Seed of the true mount of the camera.
     """
     k = spec.intrinsics
     row, size = np.array([k.fx, k.fy, k.cx, k.cy]), (k.width, k.height)

@@ -49,7 +49,7 @@ class MapScene:
 
     Args:
         scene: Table and objects.
-        mount_seed: Of the true mounts of the cameras; None is where the configuration says.
+        mount_seed: Seed of the true mounts of the cameras; None is where the configuration says.
     """
 
     def __init__(self, scene: Scene, mount_seed: int | None = None) -> None:

@@ -30,7 +30,7 @@ def rendered(arm: Arm, home: Mapping[str, float], boxes: Sequence[Box], seed: in
         arm: One of the arms; its fixed bodies are known.
         home: Joints of the robot while the cameras look.
         boxes: What stands on the table; they are known through the map alone.
-        seed: Of the noise.
+        seed: Seed of the noise.
     """
     colours = list(PALETTE)
     objects = tuple(

@@ -51,7 +51,7 @@ def load_arm(name: str, *, touching: bool = False, endless: str = "") -> Arm:
     """A robot of `ROBOTS` as an arm.
 
     Args:
-        name: Of the robot.
+        name: Name of the robot.
         touching: Whether paths keep no distance, as in the problems of the literature; lines are checked more finely
             then. False leaves the defaults.
         endless: Joint that turns without end.
@@ -71,7 +71,7 @@ class TrueMeshes:
     """A robot by the triangles of its mesh files, with bodies around it; independent of the suite's layers.
 
     Args:
-        name: Of the robot.
+        name: Name of the robot.
     """
 
     def __init__(self, name: str) -> None:

@@ -117,7 +117,7 @@ def scene(seed: int, sensor: DepthNoiseConfig) -> tuple[Cloud, Intrinsics]:
     """Return a labelled cloud and the intrinsics of its camera.
 
     Args:
-        seed: Of everything that is drawn.
+        seed: Seed of everything that is drawn.
         sensor: Noise of its depth.
     """
     r = np.random.default_rng(seed)

@@ -84,7 +84,7 @@ def parse_yaml(text: str, where: str, code: Code = Code.CONFIG_INVALID) -> Any:
     Args:
         text: At most 4 MiB.
         where: Begins the error, such as the path of a file.
-        code: Of the error.
+        code: Code of the error.
 
     Raises:
         OpenArmError: With `code`, when it is not YAML, too long, or nested too deeply.
@@ -112,7 +112,7 @@ def read_text(path: Path, code: Code = Code.CONFIG_INVALID, most: int = MAX_YAML
 
     Args:
         path: File to read.
-        code: Of the error.
+        code: Code of the error.
         most: Longest file, bytes.
 
     Raises:
@@ -156,7 +156,7 @@ def load_yaml(path: Path, code: Code = Code.CONFIG_INVALID) -> dict[str, Any]:
 
     Args:
         path: File to read.
-        code: Of the error.
+        code: Code of the error.
 
     Raises:
         OpenArmError: With `code`, when the file is missing, is not YAML, or is not a mapping; see `parse_yaml`.
@@ -213,7 +213,7 @@ def validate(model: type[ConfigT], data: dict[str, Any], where: str, code: Code 
         model: Model of the data.
         data: The mapping.
         where: Begins each fault, such as the path of a file.
-        code: Of the error.
+        code: Code of the error.
 
     Raises:
         OpenArmError: With `code`, and `where`:key for each fault.

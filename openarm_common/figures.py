@@ -31,8 +31,8 @@ def sheet(width: float, height: float, unit: float = POINT) -> Axes:
     """Make a page of an exact size, with the origin at its upper left and y down.
 
     Args:
-        width: Of the page, in units.
-        height: Of the page, in units.
+        width: Width of the page, in units.
+        height: Height of the page, in units.
         unit: Inches in a unit of the coordinates.
     """
     from matplotlib.figure import Figure
@@ -47,7 +47,7 @@ def render_figure(axes: Axes, form: Literal["png", "svg", "pdf"], *, dpi: float 
     """Return the page of axes as a file.
 
     Args:
-        axes: Of the page.
+        axes: Axes of the page.
         form: Format of the file.
         dpi: Pixels an inch, of a PNG.
         margin: When not negative, the page is cut to this distance from what is drawn, in points.

@@ -105,7 +105,7 @@ def watch(name: str, on_end: Callable[[], object] = lambda: None) -> Watched | N
     """Watch a lifeline of this machine; None when there is none of that name.
 
     Args:
-        name: Of the lifeline.
+        name: Name of the lifeline.
         on_end: Called in a thread when it ends.
     """
     connection = socket.socket(socket.AF_UNIX)

@@ -28,7 +28,7 @@ class ControlLoop(ABC):
     """Runs controllers, one control tick at a time.
 
     Args:
-        name: Of the thread.
+        name: Name of the thread.
         controller: While the thread runs, only functions given to `call` may touch it.
         crashed: Called when the thread ends by an unexpected error.
 

@@ -94,8 +94,8 @@ class KnownServos:
 
     Args:
         configured: By side; in use where nothing is stored.
-        folder: Of the records; empty: the default one.
-        dynamics_seed: Of the simulated robot that a record must be of; None: of a real one.
+        folder: Folder of the records; empty: the default one.
+        dynamics_seed: Seed of the simulated robot that a record must be of; None: of a real one.
         warn: Called with why a record can't be used.
 
     Attributes:

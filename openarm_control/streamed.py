@@ -65,7 +65,7 @@ class StreamedRobot(ControlLoop):
     """Runs controllers on a robot behind a `Driver`.
 
     Args:
-        controller: Of its joints.
+        controller: Controller of its joints.
         driver: Reaches it.
         stale_after: Age of joint states from which on nothing is commanded, s.
         observe: Called at the end of each tick.

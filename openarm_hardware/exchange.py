@@ -43,7 +43,7 @@ class State:
     """The robot as the servo sees it, at the end of a cycle.
 
     Attributes:
-        t_ns: Of the newest replies, CLOCK_MONOTONIC.
+        t_ns: Stamp of the newest replies, CLOCK_MONOTONIC.
         cycles: Since the start.
         late: Cycles that were left out, because the process was late.
         phases: Of each arm.

@@ -55,7 +55,7 @@ def scanned(buses: Sequence[str], wiring: Wiring) -> list[Found]:
 
     Args:
         buses: Addresses.
-        wiring: Of the robot; says which kind of frames is sent.
+        wiring: Wiring of the robot; says which kind of frames is sent.
 
     Raises:
         OpenArmError: As `open_bus`; ENVIRONMENT, when a bus is lost meanwhile.
@@ -73,8 +73,8 @@ def silence(address: str, wiring: Wiring) -> str:
     """Return why no motor of a bus answers, by asking with the other kind of frames.
 
     Args:
-        address: Of the bus.
-        wiring: Of the robot; says with which kind of frames no motor answered.
+        address: Address of the bus.
+        wiring: Wiring of the robot; says with which kind of frames no motor answered.
     """
     flexible = not wiring.flexible
     try:

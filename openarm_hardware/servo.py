@@ -42,7 +42,7 @@ class Link:
     """A bus that may be gone for a while.
 
     Args:
-        address: Of the bus.
+        address: Address of the bus.
         flexible: As CAN FD.
 
     Raises:

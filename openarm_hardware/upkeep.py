@@ -38,7 +38,7 @@ class Zero:
         before: Where the joint was said to be.
         after: Where it is said to be now; None: it was not changed.
         turned: By so much the motor's zero moves, rad of the motor.
-        unit: Of the joint.
+        unit: Unit of the joint.
     """
 
     joint: str
@@ -81,7 +81,7 @@ def set_id(address: str, motor: int, to: int, offset: int, *, flexible: bool) ->
     """Give a motor an id, and its replies that id and an offset, and read back that it has them; it keeps them.
 
     Args:
-        address: Of its bus.
+        address: Address of its bus.
         motor: Its present id.
         to: Its new one, or the same.
         offset: Added for its replies.

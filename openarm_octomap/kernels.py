@@ -68,7 +68,7 @@ def image_ends(
         key_min: (3,) key of the first cell of the box.
         origin: (3,) the camera.
         max_range: Surfaces further away than this mark nothing, m; negative: none does.
-        axes: Of the box, as in `VoxelBlocks`.
+        axes: Axes of the box, as in `VoxelBlocks`.
         hits: Cells that a ray ended in, of all scans of an update; changed.
         ended: Cells of the box that are among `ends`; empty before.
         table: Hash table of the keys outside of the box: a power of two long, all -1 before and after.
@@ -271,7 +271,7 @@ def walk_rays(
         key_min: (3,) key of the first cell of the box.
         origin: (3,) where the rays begin, m.
         max_range: Rays end here at the latest, m; negative: no limit.
-        axes: Of the box, as in `VoxelBlocks`.
+        axes: Axes of the box, as in `VoxelBlocks`.
         through: Cells that a ray went through; changed.
 
     Returns:

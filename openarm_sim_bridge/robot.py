@@ -30,7 +30,7 @@ class SimulatedRobot(Generic[ControllerT]):
     Args:
         description: The robot.
         world: The world.
-        controller: Of its joints.
+        controller: Controller of its joints.
 
     Attributes:
         faults: Injected faults of robot and world.
@@ -60,7 +60,7 @@ class SimulatedRobot(Generic[ControllerT]):
             scene: Table and objects.
             trajectory: How arms follow trajectories; None is the defaults.
             gripper: How grippers move; None is the defaults.
-            servos: Of the arms as identified, by side; None is what the profile says of them.
+            servos: Servos of the arms as identified, by side; None is what the profile says of them.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the model can't be built.

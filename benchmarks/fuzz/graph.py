@@ -461,7 +461,7 @@ def send_hostile(counts: dict[str, int], seed: int) -> list[Tally]:
 
     Args:
         counts: Inputs by kind.
-        seed: Of all choices; what nodes do meanwhile depends on the machine.
+        seed: Seed of all choices; what nodes do meanwhile depends on the machine.
     """
     tallies: list[Tally] = []
     with ExitStack() as stack:

@@ -108,7 +108,7 @@ def changed_type(recorded: MessageDefinition, kind: str) -> str:
 
     Args:
         recorded: As it is in a bag.
-        kind: Of the messages, such as `sensor_msgs/msg/Image`; installed.
+        kind: Kind of the messages, such as `sensor_msgs/msg/Image`; installed.
     """
     if len(recorded.data) > _LONGEST:
         return kind

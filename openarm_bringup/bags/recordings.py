@@ -19,7 +19,7 @@ class Recordings:
     """Writes recordings into a folder, which is made for the first.
 
     Args:
-        folder: Of this run.
+        folder: Folder of this run.
         most: Number of recordings that are kept.
         limit: Bytes of all of them; the newest is kept in any case.
     """

@@ -27,7 +27,7 @@ class Moment:
     """What a ring held at a time.
 
     Attributes:
-        topics: Of the messages.
+        topics: Topics of the messages.
         seconds: From the first message to the last, s.
         packed: The messages in the order of their stamps, large ones compressed.
     """

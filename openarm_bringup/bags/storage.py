@@ -101,7 +101,7 @@ def channel(
         topic: Name.
         kind: Name of the type: `package/msg/Name`, `package/Name` or `package::msg::Name`.
         count: Number of messages.
-        encoding: Of the messages; `cdr` is ROS 2's.
+        encoding: Encoding of the messages; `cdr` is ROS 2's.
         schema: Encoding of the type's definition, such as `ros2msg`.
         text: Definition of the type.
         qos: Offered qualities of service, YAML.

@@ -50,7 +50,7 @@ class CalibrationOptions:
 
     Args:
         cameras: Names.
-        mount_seed: Of the true mounts, or "none"; None is the graph's.
+        mount_seed: Seed of the true mounts, or "none"; None is the graph's.
         poses: Samples a camera at most; 0 is the node's parameter.
         enough: Repeatability that ends it, m and rad; 0 is the node's parameter.
         save: Store results that do not fail.

@@ -30,12 +30,12 @@ class Source:
     Args:
         exclude: Names of samples to leave out.
         store: Folder of stored calibrations.
-        camera: Of a bag: whose images are used; needed when it has several.
+        camera: Camera of a bag: whose images are used; needed when it has several.
         board: Of a bag: the board, such as charuco:7x5:34mm:26mm:DICT_6X6_250, its keys as YAML, or a YAML file; 4x11
             circles when not given.
         carrier: Of a bag: link that holds the board when the camera is fixed; that of the right hand when not given.
-        mount_seed: Of a bag: of simulated mounts; what it says of itself when not given.
-        session: Of a bag: file (.npz) to write the samples to.
+        mount_seed: Seed of a bag: of simulated mounts; what it says of itself when not given.
+        session: File (.npz) to write the samples of a bag to.
     """
 
     exclude: tuple[str, ...] = ()
@@ -131,7 +131,7 @@ def at_stored_zeros(samples: SampleSet, store: Path | None) -> SampleSet:
     """Return samples of a robot with the zeros of its joints that are stored; a foreign robot's stay as they are.
 
     Args:
-        samples: Of a session.
+        samples: Samples of a session.
         store: Folder of stored calibrations.
 
     Raises:

@@ -51,7 +51,7 @@ def auto(
 
     Args:
         camera: Name of a camera, at the zeros that are stored; or "all" whose mounts are uncertain, with the zeros.
-        mount_seed: Of the simulated mounts, or "none"; that of the graph `calibrate` when not given.
+        mount_seed: Seed of the simulated mounts, or "none"; that of the graph `calibrate` when not given.
         poses: Samples a camera at most; 0: the node's parameter auto.poses.
         save: Store the result, unless it fails the limits.
         store: Folder of stored calibrations.
@@ -136,7 +136,7 @@ def table(
     Args:
         camera: Whose depth is used; that of the camera over the table when not given.
         block_height: Of a block that stands on the table, m, whose top is measured instead of the table's surface.
-        label: Of that block, when several objects are in view.
+        label: Label of that block, when several objects are in view.
         dry_run: Measure, and store nothing.
     """
     join_graph(domain)

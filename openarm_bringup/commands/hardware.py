@@ -156,7 +156,7 @@ def learn_hand(
     Stored as calibrations are. Asks before it does it: nothing may be between the fingers, nor come there.
 
     Args:
-        arm: Whose hand; those of all arms when not given.
+        arm: Arm of the hand; those of all arms when not given.
         yes: Do not ask.
     """
     join_graph(domain)

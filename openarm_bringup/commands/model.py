@@ -71,7 +71,7 @@ def new(
     """Draft the folder of a robot, `models/robots/NAME`, from its maker's MJCF or URDF.
 
     Args:
-        name: Of the robot.
+        name: Name of the robot.
         mjcf: The maker's MJCF.
         urdf: The maker's URDF or xacro (`.xacro`), in place of an MJCF.
         arm: NAME=BASE_LINK:TIP_LINK of an arm: what it stands on, and its tool centre point; may be repeated.
@@ -112,7 +112,7 @@ def semantics(name: str) -> Outcome:
     """Write the SRDF of a robot from its `semantics.yaml`, with a sampled collision matrix; takes minutes.
 
     Args:
-        name: Of the robot, or the path of its folder.
+        name: Name of the robot, or the path of its folder.
     """
     from openarm_sim_bridge.drafting.semantics import write_srdf
 
@@ -130,7 +130,7 @@ def work(name: str) -> Outcome:
     """Find where a robot grasps on its table; write that, and the cameras and postures that a draft lacks.
 
     Args:
-        name: Of the robot, or the path of its folder.
+        name: Name of the robot, or the path of its folder.
     """
     from openarm_bringup.workplace import find_workplace
 
@@ -144,7 +144,7 @@ def check(name: str) -> Outcome:
     """Say everything that is wrong with the folder of a robot: parts, meshes, limits, postures, contacts, MuJoCo.
 
     Args:
-        name: Of the robot, or the path of its folder.
+        name: Name of the robot, or the path of its folder.
     """
     from openarm_sim_bridge.drafting.check import folder_faults
 

@@ -51,7 +51,7 @@ def perceive(
         depth: Topic of the depth image in a bag or graph, likewise.
         camera: Namespace of the camera in a bag or graph, such as /camera/camera, or a part of it; the only one when
             not given.
-        start: Of a bag, only from this long after its first message on, s.
+        start: Start in a bag: only from this long after its first message on, s.
         out: Folder for pictures, the label image and a page.
         depth_scale: Metres of a count of depth, of every encoding: 0.0001 for a D405, 0.0002 for TUM, 0.001 for floats
             in mm; 0.001 for integers and 1 for floats when not given.

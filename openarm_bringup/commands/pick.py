@@ -54,10 +54,10 @@ def pick(
         arm: Which arm: auto when not given.
         at: x y near the object, base frame, m: selects one of several alike.
         place: Where to: x y z of the footprint centre, base frame, m (z is not read: the table); chosen when not given.
-        yaw: Of the object where it is put down, degrees about the vertical; unconstrained when not given.
+        yaw: Yaw of the object where it is put down, degrees about the vertical; unconstrained when not given.
         phase: pick ends with the object in the hand, place puts down what the hand holds; all does both. aside pushes
             the object away from where it is.
-        time_limit: Of the robot, s; then it holds, and the hand keeps what it holds. 0 is none.
+        time_limit: Time limit of the robot, s; then it holds, and the hand keeps what it holds. 0 is none.
         dry_run: Plan and report, do not move.
         confirm: Show each plan and ask before it is executed; without a terminal, /grasp/confirm is to answer.
         timeout: Longest wait, s.

@@ -53,7 +53,7 @@ def topic_type(name: str, *, domain: Domain = None) -> Outcome:
     """Print the type of a topic.
 
     Args:
-        name: Of the topic.
+        name: Name of the topic.
     """
     return _type("topic", name, domain)
 
@@ -63,7 +63,7 @@ def topic_info(name: str, *, domain: Domain = None) -> Outcome:
     """Show the type of a topic, and who publishes and subscribes to it with which quality of service.
 
     Args:
-        name: Of the topic.
+        name: Name of the topic.
     """
     with graph_peer(domain) as peer:
         found, kind = peer.find("topic", name)
@@ -85,7 +85,7 @@ def echo(name: str, *, count: Count = 0, full: bool = False, timeout: float = 10
     """Print the messages of a topic as YAML, until Ctrl-C.
 
     Args:
-        name: Of the topic.
+        name: Name of the topic.
         count: End after this many messages; 0: no limit.
         full: Print long arrays whole.
         timeout: Longest wait for the first message, s.
@@ -120,7 +120,7 @@ def hz(name: str, *, seconds: float = 5.0, domain: Domain = None) -> Outcome:
     The delay holds where publisher and this machine have one clock.
 
     Args:
-        name: Of the topic.
+        name: Name of the topic.
         seconds: How long.
     """
     from statistics import median
@@ -176,7 +176,7 @@ def pub(
     """Publish a message, given as YAML: once, or as a stream.
 
     Args:
-        name: Of the topic.
+        name: Name of the topic.
         message: Its fields, such as "{name: [a], position: [0.1]}"; what is left out keeps its default. As with ros2,
             the type may precede it.
         type_: Of the message, where no other node has the topic.
@@ -245,7 +245,7 @@ def service_type(name: str, *, domain: Domain = None) -> Outcome:
     """Print the type of a service.
 
     Args:
-        name: Of the service.
+        name: Name of the service.
     """
     return _type("service", name, domain)
 
@@ -255,7 +255,7 @@ def call(name: str, *request: str, timeout: float = 30.0, domain: Domain = None)
     """Call a service; the request and the answer are YAML. The exit code follows the answer's `success`, if it has one.
 
     Args:
-        name: Of the service.
+        name: Name of the service.
         request: Its fields, such as "{label: red}"; as with ros2, the type may precede it.
         timeout: Longest wait for the answer, s.
     """
@@ -282,7 +282,7 @@ def send(name: str, *goal: str, feedback: bool = False, timeout: float = 300.0, 
     """Send a goal and wait for its result; Ctrl-C cancels it.
 
     Args:
-        name: Of the action.
+        name: Name of the action.
         goal: Its fields as YAML; as with ros2, the type may precede it.
         feedback: Print the feedback.
         timeout: Longest wait for the result, s.
@@ -324,7 +324,7 @@ def info(name: str, *, domain: Domain = None) -> Outcome:
     """Show what a node publishes and subscribes to, the services that it offers and calls, and its actions.
 
     Args:
-        name: Of the node.
+        name: Name of the node.
     """
     with graph_peer(domain) as peer:
         found, _ = peer.find("node", name)
@@ -394,7 +394,7 @@ def param_get(node: str, name: str, *, domain: Domain = None) -> Outcome:
 
     Args:
         node: Name of the node.
-        name: Of the parameter, such as approach.lift_height.
+        name: Name of the parameter, such as approach.lift_height.
     """
     with graph_peer(domain) as peer:
         value = peer.parameters(node).get([name])[name]
@@ -423,7 +423,7 @@ def param_set(node: str, name: str, value: str, *, domain: Domain = None) -> Out
 
     Args:
         node: Name of the node.
-        name: Of the parameter.
+        name: Name of the parameter.
         value: As YAML.
     """
     from openarm_common.config import parse_yaml

@@ -95,7 +95,7 @@ class Daemon:
 
     Args:
         listener: Socket that the supervisor has opened.
-        domain: Of the graph; the environment says the same.
+        domain: Domain of the graph; the environment says the same.
     """
 
     def __init__(self, listener: socket.socket, domain: int) -> None:

@@ -25,7 +25,7 @@ def check_can(address: str, sys: Path, link: Mapping[str, Any] | None, *, flexib
     """Check the interface of a bus `socketcan:NAME`.
 
     Args:
-        address: Of hardware.yaml.
+        address: Address of hardware.yaml.
         sys: /sys.
         link: What `ip -details -statistics -json link show NAME` says of it; None without `ip`.
         flexible: Whether frames are sent as CAN FD.
@@ -72,8 +72,8 @@ def check_motors(address: str, wiring: Wiring) -> Finding:
     """Check that motors answer on a bus, with both kinds of frames when they do not with the one; only asks.
 
     Args:
-        address: Of the bus.
-        wiring: Of the robot.
+        address: Address of the bus.
+        wiring: Wiring of the robot.
     """
     from openarm_hardware.scan import scanned, silence, unset
     from openarm_hardware.servo import Ownership

@@ -24,7 +24,7 @@ def reset_world(
     Args:
         client: Node that asks.
         scene: Name or path of the scene, or "random"; empty keeps the present one.
-        seed: Of a random scene.
+        seed: Seed of a random scene.
         timeout: Longest wait for the answer, s of wall clock.
         joints: Positions that are not those of the home posture, rad or m.
 

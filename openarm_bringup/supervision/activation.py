@@ -33,7 +33,7 @@ class Activation:
     """Keeps the daemon of a graph.
 
     Args:
-        supervisor: Of the graph.
+        supervisor: Supervisor of the graph.
     """
 
     def __init__(self, supervisor: Supervisor) -> None:

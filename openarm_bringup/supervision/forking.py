@@ -53,7 +53,7 @@ class ForkServer:
         """Start `python -m MODULE ARGS`, forked; without a server, as any command.
 
         Args:
-            name: Of the process.
+            name: Name of the process.
             argv: The command.
             env: Its whole environment.
         """

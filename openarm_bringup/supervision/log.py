@@ -16,7 +16,7 @@ class LogFile:
     """Appends lines with the time of day; what the disk does not take is counted, and the file says how much it was.
 
     Args:
-        path: Of the file, which is made with the first line.
+        path: Path of the file, which is made with the first line.
         fault: Is called with the reason when lines begin to be lost.
     """
 

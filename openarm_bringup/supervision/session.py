@@ -65,7 +65,7 @@ async def work_until_stopped(
     """Do blocking work in a thread while a graph runs; when the graph is to stop, cancel the work.
 
     Args:
-        supervisor: Of the graph, which is ready.
+        supervisor: Supervisor of the graph, which is ready.
         work: Runs in a daemon thread: an abandoned wait inside it can't keep the process from ending.
         cancel: Asks the work to end.
         grace: Longest wait for that, s.

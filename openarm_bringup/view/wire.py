@@ -112,7 +112,7 @@ def thin_cloud(
         deprojector: With the limits of the camera.
         depth: (h, w), uint16 mm or float32 m.
         rgb: (h, w, 3) of the same frame.
-        intrinsics: Of both.
+        intrinsics: Intrinsics of both.
         T_base_optical: Where the camera is.
         edge: One point is kept for each cell of this edge, m.
         stride: Step between the pixels that are used, along rows and columns.

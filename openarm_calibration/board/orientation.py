@@ -17,7 +17,7 @@ def fronts(plane: Array, pixels: Array, rows: int, columns: int) -> list[Array]:
     Args:
         plane: (n, 2) marks on the board, row by row.
         pixels: (n, 2) in the order of the finder, row by row.
-        rows: Of marks.
+        rows: Rows of marks.
         columns: Of marks.
     """
     grid = pixels.reshape(rows, columns, 2)

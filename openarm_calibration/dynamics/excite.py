@@ -48,7 +48,7 @@ def postures(
         upper: The same.
         load: Torques of the arm.
         free: Whether a configuration is free of collisions.
-        count: Of postures.
+        count: Number of postures.
         rng: Draws what is tried.
 
     Raises:

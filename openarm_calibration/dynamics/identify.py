@@ -64,7 +64,7 @@ class Identified:
 
         Args:
             arm: Name of the arm.
-            dynamics_seed: Of the simulated robot; None: a real one.
+            dynamics_seed: Seed of the simulated robot; None: a real one.
         """
         servos = self.servos
         values = {

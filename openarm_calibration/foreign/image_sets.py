@@ -202,9 +202,9 @@ def _marks(corners: Array, label: str, board: Board, lens: Lens) -> list[_View]:
 
     Args:
         corners: (m, 2), or (m, 3) with their numbers; NaN beyond those that there are.
-        label: Of the record.
+        label: Label of the record.
         board: Whose corners they are.
-        lens: Of the camera.
+        lens: Lens of the camera.
     """
     if corners.shape[1] == 3:
         seen = corners[np.isfinite(corners).all(axis=1)]

@@ -38,7 +38,7 @@ class Kinematics:
         Args:
             q: Positions that the encoders report, rad.
             change: (parameters,) rad, m, rad/(N m).
-            torque: Of the joints, N m; none for stiff ones.
+            torque: Torque of the joints, N m; none for stiff ones.
         """
         at = dict(zip(self.parameters, np.asarray(change).tolist(), strict=True))
         index = {name: k for k, name in enumerate(self.parameters)}

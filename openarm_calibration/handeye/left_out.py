@@ -78,7 +78,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
 
     Args:
         problem: All views.
-        solution: Of them.
+        solution: Solution of them.
         folds: Number of groups.
     """
     used = np.flatnonzero(solution.used)
@@ -178,7 +178,7 @@ def rival(problem: Problem, solution: Solution, one_out: Held) -> Rival | None:
 
     Args:
         problem: All views.
-        solution: Of them; of one camera and one board.
+        solution: Solution of them; of one camera and one board.
         one_out: Its errors, each pose left out.
     """
     part = problem.subset(solution.used)

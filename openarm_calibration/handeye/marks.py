@@ -106,7 +106,7 @@ def normal_equations(
         radii: (views,) radius of the circles, m; 0 for points.
         poses: (views, 4, 4) T_camera_board.
         intrinsics: (views, 4) fx, fy, cx, cy, or (views, 6) with k1, k2.
-        scale: Of the board.
+        scale: Scale of the board.
 
     Returns:
         (views, c, c) JᵀJ, (views, c) Jᵀr and (views,) rᵀr, with c = 11 columns, 13 with distortion; the last is
@@ -145,10 +145,10 @@ def project(
 
     Args:
         points: (n, 3) marks in the board frame, m.
-        radius: Of the circles, m; 0 for points.
+        radius: Radius of the circles, m; 0 for points.
         pose: (4, 4).
         intrinsics: (4,) fx, fy, cx, cy, or (6,) with k1, k2.
-        scale: Of the board.
+        scale: Scale of the board.
     """
     out = np.full((len(points), 2), np.nan)
     rows = np.zeros((2, BEFORE_OPTICS + len(intrinsics)))

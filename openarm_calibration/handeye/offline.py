@@ -79,8 +79,8 @@ def calibrate(
     Args:
         samples: At least three poses that differ in rotation about two axes.
         algorithm: What the stored mount is of; the refinement unless a comparison wants otherwise.
-        config: Of the solver.
-        limits: Of the verdict.
+        config: Parameters of the solver.
+        limits: Limits of the verdict.
         session: Hash of the session, for the record.
         created: When, as ISO 8601, for the record.
         stored: The calibration in use until now, for the drift.
@@ -120,10 +120,10 @@ def judged(
     """Judge a solution of a session, and make what is to be stored; other arguments and errors as for `calibrate`.
 
     Args:
-        samples: Of one camera.
-        solution: Of them.
+        samples: Samples of one camera.
+        solution: Solution of them.
         algorithm: See `calibrate`.
-        limits: Of the verdict.
+        limits: Limits of the verdict.
         session: Hash of the session.
         created: When.
         stored: The calibration in use until now.
@@ -178,7 +178,7 @@ def join(sessions: Sequence[SampleSet], *, one_board: bool = True) -> tuple[Prob
     """Return the problem of all sessions, and those of each.
 
     Args:
-        sessions: Of different cameras.
+        sessions: Sessions of different cameras.
         one_board: Whether sessions in which the same link carries the same board found it in the same place.
 
     Raises:
@@ -237,8 +237,8 @@ def calibrate_together(
 
     Args:
         sessions: One for each camera.
-        config: Of the solver; without extras.
-        limits: Of the verdicts.
+        config: Parameters of the solver; without extras.
+        limits: Limits of the verdicts.
         hashes: Of the sessions, for the record; none, or one for each.
         created: When, as ISO 8601, for the record.
         stored: The calibrations in use until now, for the drift; none, or one for each.
@@ -270,7 +270,7 @@ def part_of(joint: Solution, mine: Mask, own: Problem) -> Solution:
     """Extract the solution of one camera and one board; of zeros of the joints it takes what was found for known.
 
     Args:
-        joint: Of several cameras or boards.
+        joint: Joint solution of several cameras or boards.
         mine: (n,) views of that camera and board.
         own: The problem of these views alone.
     """

@@ -64,7 +64,7 @@ class View:
         pixels: (n, 2) where they were detected.
         A: (4, 4) T_base_gripper at the stamp of the image, as the robot reports; not used when `fixed`.
         setup: Which of camera and board the gripper carries.
-        radius: Of the circles, m; 0 for corner points.
+        radius: Radius of the circles, m; 0 for corner points.
         camera: Index of the camera.
         board: Index of the board mount.
         pose: Number of the robot pose; views of the same one share its error.
@@ -163,7 +163,7 @@ def assemble(views: Sequence[View], intrinsics: Sequence[Intrinsics], guesses: S
 
     Args:
         views: At least one.
-        intrinsics: Of each camera.
+        intrinsics: Intrinsics of each camera.
         guesses: (4, 4) T_camera_board of each view, near enough for least squares (see `detect.guess_pose`).
     """
     raw = _pack(tuple(views), tuple(intrinsics), np.array(guesses), np.zeros(len(views)))

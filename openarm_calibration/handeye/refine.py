@@ -69,7 +69,7 @@ def linearise(problem: Problem, state: State, extras: Sequence[Extra], priors: P
         problem: The views.
         state: The unknowns.
         extras: More unknowns.
-        priors: Of these.
+        priors: Priors of these.
     """
     if "zeros" in extras:
         problem = problem.posed(state.zeros)
@@ -138,7 +138,7 @@ def evidence(problem: Problem, linear: Linear, noise: Noise, extras: Sequence[Ex
         linear: At the answer.
         noise: Standard deviations.
         extras: That are free.
-        priors: Of these; a constant is missing where one is infinite.
+        priors: Priors of these; a constant is missing where one is infinite.
     """
     value = criterion(*linear.weighed(noise), max(noise.translation, FLOOR), max(noise.rotation, FLOOR))
     sigma, _ = priors.of(problem, extras)
@@ -179,7 +179,7 @@ def refine(
         noise: Standard deviations; those of the robot are a starting point when they are to be estimated.
         zeros: (joints,) to start from; None: 0.
         extras: More unknowns: scale, delay, intrinsics, distortion, zeros.
-        priors: Of these.
+        priors: Priors of these.
         estimate_robot: Whether the spread of the robot's errors is found from the data.
         estimate_px: Whether that of the marks follows the extras.
         estimate_misfit: Whether a misfit may be found, where the robot is.
@@ -259,7 +259,7 @@ def information_at(
         Z: (boards, 4, 4).
         noise: Standard deviations.
         extras: More unknowns, at their usual values.
-        priors: Of these.
+        priors: Priors of these.
     """
     return eliminate(linearise(problem, State.start(problem, X, Z), extras, priors), noise)[0]
 
@@ -320,7 +320,7 @@ def fit_all(
         Z: (boards, 4, 4) to start from.
         noise: To start from.
         extras: More unknowns.
-        priors: Of these.
+        priors: Priors of these.
 
     Raises:
         OpenArmError: As `refine`.
@@ -339,7 +339,7 @@ def with_zeros(problem: Problem, known: Estimate, priors: Priors = FREE) -> Esti
     Args:
         problem: The views; without joint positions the answer is returned as it is.
         known: With zeros as the robot reports them.
-        priors: Of its extras.
+        priors: Priors of its extras.
     """
     best = start = known
     worse = 0

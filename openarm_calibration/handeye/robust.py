@@ -154,7 +154,7 @@ def solve_robustly(
     Args:
         problem: At least three robot poses that differ in rotation about two axes.
         config: How.
-        priors: Of the extras.
+        priors: Priors of the extras.
         start: A solution of nearly the same problem, to start from; None: a closed form.
 
     Raises:

@@ -78,8 +78,8 @@ def check_touches(
     """Compare touches with where a solution has the board.
 
     Args:
-        samples: Of a camera in the hand, with the robot at the zeros of its joints that are in use.
-        solution: Of these samples.
+        samples: Samples of a camera in the hand, with the robot at the zeros of its joints that are in use.
+        solution: Solution of these samples.
         touches: Of the same board in the same place, by any arm.
         tip: (3,) in the frame of the hand's tool centre point.
         steady: Standard deviation of a touch, by axis.

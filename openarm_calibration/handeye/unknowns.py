@@ -56,11 +56,11 @@ class Priors:
     """What is known of the extras before anything is seen: standard deviations, infinite where nothing is.
 
     Args:
-        scale: Of the board.
+        scale: Scale of the board.
         delay: Of the images, s.
-        focal: Of fx and fy, as a fraction.
-        centre: Of cx and cy, px.
-        distortion: Of k1 and of k2.
+        focal: Deviation of fx and fy, as a fraction.
+        centre: Deviation of cx and cy, px.
+        distortion: Deviation of k1 and of k2.
         zeros: (joints,) of the offsets, rad; None: infinite.
         level: Boards that lie on a level table: deviation of the tilt about each axis by number of the board, rad.
     """
@@ -130,7 +130,7 @@ class State:
         Z: (boards, 4, 4) mounts of the boards.
         correction: (poses, 6) of the robot's poses.
         intrinsics: (cameras, 4) changes of fx, fy, cx, cy, px.
-        scale: Of the board.
+        scale: Scale of the board.
         delay: Of the images, s.
         distortion: (cameras, 2) k1, k2.
         zeros: (joints,) offsets of the joints; without them A is that of the view, rad.

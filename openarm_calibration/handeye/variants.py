@@ -32,7 +32,7 @@ class Variant:
     """Poses without one mistake.
 
     Args:
-        name: Of the mistake.
+        name: Name of the mistake.
         text: The mistake in a sentence.
         A: (n, 4, 4) poses without it.
     """

@@ -75,8 +75,8 @@ def estimate_delay(samples: SampleSet, config: SolveConfig | None = None, rounds
     The deviation is infinite when the robot stood in all samples.
 
     Args:
-        samples: Of a moving robot.
-        config: Of the solver.
+        samples: Samples of a moving robot.
+        config: Parameters of the solver.
         rounds: At most.
     """
     config = config or SolveConfig(most_translation=0.1, most_rotation=0.2, reject_outliers=False)
@@ -104,7 +104,7 @@ def assess(
 
     Args:
         problem: All views.
-        solution: Of them.
+        solution: Solution of them.
         limits: None is the defaults.
         stored: (4, 4) the mount X in use until now, for the drift.
         by_zeros: Accuracy with zeros of the joints that may be off; None: they are taken for exact.
@@ -227,7 +227,7 @@ def accuracy(solution: Solution, limits: Limits) -> tuple[float, float]:
     much as the data then want, and that counts as error too. Repeatability, of `Solution.sigma`, takes them for exact.
 
     Args:
-        solution: Of one camera.
+        solution: Solution of one camera.
         limits: Deviations of the intrinsics.
     """
     now = solution.estimate

@@ -63,7 +63,7 @@ class ZerosCalibration:
         result: Of the solver.
         zeros: To be stored.
         cameras: Each session with the zeros that were found, judged.
-        mounts: Of the cameras, to be stored with them.
+        mounts: Mounts of the cameras, to be stored with them.
         before: Errors of left-out poses with the zeros of the description.
         after: The same with the zeros that were found.
         failures: Why they are not to be stored; none if they are.
@@ -126,7 +126,7 @@ def arm_views(sessions: Sequence[SampleSet]) -> tuple[tuple[ArmView, ...], tuple
     Sessions of one camera on the same link share its mount; each session has a board of its own.
 
     Args:
-        sessions: Of one robot, of any cameras and arms.
+        sessions: Sessions of one robot, of any cameras and arms.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for sessions of different robots, or of one camera with different intrinsics.
@@ -165,9 +165,9 @@ def calibrate_zeros(
     """Find the zeros of the joints with the mounts of all cameras, and judge them by poses that are left out.
 
     Args:
-        sessions: Of one robot; any number of cameras and arms.
+        sessions: Sessions of one robot; any number of cameras and arms.
         config: Priors.
-        limits: Of the verdicts.
+        limits: Limits of the verdicts.
         hashes: Of the sessions, for the record.
         created: When, as ISO 8601, for the record.
 

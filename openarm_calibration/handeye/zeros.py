@@ -72,7 +72,7 @@ class ArmView:
         tip: Link whose pose A is.
         q: Positions that the encoders report, rad.
         guess: (4, 4) T_camera_board.
-        torque: Of the joints, N m; for flexure.
+        torque: Torque of the joints, N m; for flexure.
     """
 
     view: View
@@ -88,7 +88,7 @@ class ZerosResult:
     """Offsets of the joints: where a joint is, minus what its encoder reports; and the rest of the parameters.
 
     Args:
-        names: Of the parameters: a joint for its offset, `joint length`, `joint flexure`.
+        names: Names of the parameters: a joint for its offset, `joint length`, `joint flexure`.
         values: (parameters,) rad, m, rad/(N m).
         covariance: (parameters, parameters), the prior included.
         prior: (parameters,) standard deviations before anything was seen.
@@ -192,8 +192,8 @@ def arm_problem(
     Args:
         description: The robot.
         views: At least one.
-        intrinsics: Of each camera.
-        names: Of the parameters, as in `ZerosResult`.
+        intrinsics: Intrinsics of each camera.
+        names: Names of the parameters, as in `ZerosResult`.
     """
     chains = {ends: Kinematics(description, *ends, names) for ends in {(view.base, view.tip) for view in views}}
     armed = [replace(view.view, arm=Posture(chains[view.base, view.tip], view.q, view.torque)) for view in views]
@@ -219,7 +219,7 @@ def solve_zeros(
     Args:
         description: The robot, whose forward kinematics the reported positions are put through.
         views: Of any number of sets: `View.camera` and `View.board` number the mounts, `View.pose` the robot poses.
-        intrinsics: Of each camera.
+        intrinsics: Intrinsics of each camera.
         config: Priors.
         start: A solution of nearly the same views, to start from.
 

@@ -36,7 +36,7 @@ def fill(message: AutoCalibrate.Result | ComputeCalibration.Response, solved: Re
     """Write a solved calibration into an answer.
 
     Args:
-        message: Of the action, or of compute_calibration.
+        message: Message of the action, or of compute_calibration.
         solved: The result.
         child: Frame whose mount it is.
     """

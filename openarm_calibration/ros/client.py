@@ -96,8 +96,8 @@ class CalibrationClient(BackgroundNode):
 
         Args:
             camera: One with a detector.
-            block_height: Of a block whose top is measured, m; 0: the surface of the table.
-            label: Of that block.
+            block_height: Height of a block whose top is measured, m; 0: the surface of the table.
+            label: Label of that block.
         """
         request = MeasureTable.Request(block_height=block_height, label=label)
         deadline = time.monotonic() + _IMAGE_S

@@ -27,8 +27,8 @@ class ImageCapture:
 
     Args:
         node: That subscribes.
-        states: Of the robot; subscribed to only while an image is waited for.
-        name: Of the camera.
+        states: States of the robot; subscribed to only while an image is waited for.
+        name: Name of the camera.
         config: Timeouts and the gate's window.
     """
 

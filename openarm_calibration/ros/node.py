@@ -53,7 +53,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
 
     Attributes:
         camera: The camera that is calibrated.
-        samples: Of this camera, so far.
+        samples: Samples of this camera, so far.
         algorithm: What `compute_calibration` uses.
         capture: Takes images of this camera.
     """
@@ -91,7 +91,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         """Start over with a camera, without samples.
 
         Args:
-            name: Of the camera.
+            name: Name of the camera.
             carrier: Link that holds the board of a fixed camera; "": the parameter.
 
         Raises:

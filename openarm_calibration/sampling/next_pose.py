@@ -152,7 +152,7 @@ class PoseSearch:
         description: The robot.
         nominal: (4, 4) T_parent_optical of the camera as mounted on paper.
         board: (4, 4) mount of the board, roughly; None: unknown.
-        config: Of the search.
+        config: Parameters of the search.
     """
 
     def __init__(

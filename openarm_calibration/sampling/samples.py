@@ -87,7 +87,7 @@ class Sample:
         t_image_ns: Stamp of the image.
         t_joints_ns: Stamp of the nearest joint state.
         joints: Positions at the stamp of the image, rad or m.
-        speed: Of the fastest joint, rad/s.
+        speed: Speed of the fastest joint, rad/s.
         detection: Marks of the board.
         T_camera_board: (4, 4) by the marks alone.
         png: The image; may be empty.
@@ -331,8 +331,8 @@ def load_session(path: Path, description: RobotDescription) -> tuple[SampleSet, 
     """Read a session file; returns the samples and the hash.
 
     Args:
-        path: Of the session.
-        description: Of the robot, unless the session keeps one of its own.
+        path: Path of the session.
+        description: Description of the robot, unless the session keeps one of its own.
 
     Raises:
         OpenArmError: CONFIG_INVALID, when it is missing, damaged, no session, or of another robot.

@@ -41,7 +41,7 @@ class Stretch:
     """Images one after the other with the same answer of the gate.
 
     Args:
-        stamps: Of the images.
+        stamps: Stamps of the images.
         robot: At each, where the gate accepts them.
         code: OK, or the gate's.
         reason: Why no image of it is taken, as far as is known; of the first image.
@@ -69,7 +69,7 @@ def stretches(
     """Divide the images of a recording by the answer of the gate.
 
     Args:
-        stamps: Of the images.
+        stamps: Stamps of the images.
         states: Joint states in the order of their stamps.
         names: Joints that move camera or board.
         robot: Their robot.

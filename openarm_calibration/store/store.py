@@ -173,7 +173,7 @@ def of_these_mounts(
         stores: As `places` lists them.
         camera: Name of the camera.
         parent: Link that carries it.
-        mount_seed: Of the simulated mounts in use.
+        mount_seed: Seed of the simulated mounts in use.
     """
     faults: list[str] = []
     for store in stores:

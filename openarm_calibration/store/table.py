@@ -39,7 +39,7 @@ class TableStore(RecordStore[StoredTable]):
     """The height of the table, below a folder of calibrations.
 
     Args:
-        folder: Of the calibrations.
+        folder: Folder of the calibrations.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -50,7 +50,7 @@ class TableStore(RecordStore[StoredTable]):
 
         Args:
             configured: What the scene says, m.
-            mount_seed: Of the simulated mounts in use.
+            mount_seed: Seed of the simulated mounts in use.
         """
         nominal = "of the scene"
         try:

@@ -45,7 +45,7 @@ def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> Non
 
     Args:
         what: Name of the image.
-        shape: Of the image.
+        shape: Shape of the image.
         intrinsics: Those that are said to be its camera's.
 
     Raises:
@@ -65,7 +65,7 @@ class DepthView:
 
     Attributes:
         depth: (h, w) planar depth, uint16 mm or float32 m.
-        intrinsics: Of the camera.
+        intrinsics: Intrinsics of the camera.
         T_base_camera: Optical frame in the base frame, (4, 4).
         near: Nearest valid depth, m.
         far: Farthest valid depth, m.

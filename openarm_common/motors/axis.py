@@ -12,11 +12,11 @@ class Axis:
 
     Attributes:
         joint: Its name.
-        arm: Whose it is.
+        arm: Arm whose it is.
         bus: Address.
-        id: Of frames to it.
+        id: Id of frames to it.
         reply_id: Of frames from it.
-        type: Of the motor.
+        type: Type of the motor.
         ratio: Motor position by joint position; negative where they turn against each other.
         offset: Motor position where the joint is at 0, rad.
         lower, upper: Limits of the joint.
@@ -25,7 +25,7 @@ class Axis:
         damping: kd with which it stops softly.
         torque: Largest of the motor, N m.
         grips: Commanded by POS_FORCE instead of MIT.
-        unit: Of the joint's position, rad or m.
+        unit: Unit of the joint's position, rad or m.
     """
 
     joint: str

@@ -266,7 +266,7 @@ def emulated_buses(domain: int, arms: Sequence[str], folder: str = "") -> dict[s
     Args:
         domain: ROS domain, by which those of several graphs differ.
         arms: Names.
-        folder: Of their sockets; empty: they are no files.
+        folder: Folder of their sockets; empty: they are no files.
     """
     return {arm: f"unix:{folder}/{arm}" if folder else f"unix:@openarm_motors_{domain}_{arm}" for arm in arms}
 

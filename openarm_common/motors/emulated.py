@@ -199,7 +199,7 @@ class EmulatedBuses:
 
     Args:
         motors: All of them.
-        seed: Of lost replies.
+        seed: Seed of lost replies.
     """
 
     def __init__(self, motors: Sequence[EmulatedMotor], seed: int = 0) -> None:

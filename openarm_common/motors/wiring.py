@@ -31,7 +31,7 @@ class JointMotors(Config):
         types: Of the motors.
         stiffness, damping: Gains kp and kd of their commands, N m/rad and N m s/rad.
         stop_damping: kd with which an arm stops softly when it can't be held.
-        ids: Of frames to them, unless an arm has its own; of frames from them `reply_offset` is added.
+        ids: Ids of frames to them, unless an arm has its own; of frames from them `reply_offset` is added.
         reply_offset: Added to the ids.
         directions: 1, or -1 where motor and joint turn against each other.
     """
@@ -64,8 +64,8 @@ class GripperMotor(Config):
     """Motor of the fingers, commanded by POS_FORCE, which limits its force.
 
     Attributes:
-        type: Of the motor.
-        id: Of frames to it.
+        type: Type of the motor.
+        id: Id of frames to it.
         ratio: Motor position by position of the finger joint, rad by m or rad; of a hand whose `finger_sign` is 1.
         speed: Largest of the motor, rad/s.
         torque: Largest of the motor, N m.
@@ -84,7 +84,7 @@ class ArmWiring(Config):
     Attributes:
         bus: Address; `openarm_common.motors.bus.open_bus`.
         offsets: Motor positions where the joints are at 0, rad; empty: 0.
-        ids: Of frames to its motors, the gripper's last, where another arm is on the same bus; empty: those of
+        ids: Ids of frames to its motors, the gripper's last, where another arm is on the same bus; empty: those of
             `joints` and `gripper`.
     """
 
@@ -127,7 +127,7 @@ def axes_of(wiring: Wiring, description: RobotDescription, buses: Mapping[str, s
     """Return the motors in the order of the controlled joints.
 
     Args:
-        wiring: Of the robot.
+        wiring: Wiring of the robot.
         description: The robot.
         buses: Addresses by arm, in place of those of the wiring; arms of one bus have that of the first of them.
 

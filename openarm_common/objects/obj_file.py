@@ -28,7 +28,7 @@ class ObjMesh:
         triangles: (m, 3) indices of vertices.
         uv_triangles: (m, 3) indices of `uv`; -1 where a corner has none.
         groups: (m,) number of the `o` or `g` that a triangle belongs to.
-        names: Of the groups.
+        names: Names of the groups.
         materials: File of the materials (`mtllib`); "" without.
     """
 

@@ -39,8 +39,8 @@ class Side:
 
     Attributes:
         R: (3, 3) turn of the solid's frame that puts the side down, the shorter edge of its footprint along x.
-        share: Of random drops that end on it, 0 to 1.
-        height: Of the centre of mass above the table, m.
+        share: Share of random drops that end on it, 0 to 1.
+        height: Height of the centre of mass above the table, m.
     """
 
     R: Array

@@ -158,7 +158,7 @@ def fill_box(rows: Rows, shape: Ints, first: Ints, last: Ints, code: int) -> boo
         shape: (3,) blocks along each axis.
         first: (3,) index of the lowest cell.
         last: (3,) index behind the highest cell.
-        code: Of the palette.
+        code: Code of the palette.
 
     Returns:
         Whether there were rows enough; if not, a part is done, and a call with more rows does all.

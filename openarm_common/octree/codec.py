@@ -130,7 +130,7 @@ class _Levels:
         blocks: (2, 3) key of the first block at level 3, and blocks along each axis.
         shift: (17, 3) index in each level of the parent of the first node of the level below.
         layout: (17,) where each level begins in an array of all nodes, (17, 3) shape, (17, 3) key of the first node.
-        states: Of all nodes, 0 at first.
+        states: States of all nodes, 0 at first.
     """
 
     def __init__(self, blocks: VoxelBlocks) -> None:

@@ -33,7 +33,7 @@ def resampled(leaves: Leaves, edge: float, lattice: Lattice, T_map_leaves: Array
 
     Args:
         leaves: Begins with the first leaves each time: (n, 4) level, x, y, z key at that level, and log-odds (n,).
-        edge: Of their cells of level 0, m.
+        edge: Edge of their cells of level 0, m.
         lattice: The box; its faces lie at keys that are multiples of 8.
         T_map_leaves: (4, 4) the leaves' frame in that of the box.
 

@@ -85,7 +85,7 @@ class RobotDescription:
         learned, where `OPENARM_ZEROS` names them.
 
         Args:
-            name: Of its folder; "": that of this process.
+            name: Name of its folder; "": that of this process.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, listing the robots there are; CONFIG_INVALID, when a file of it is faulty.

@@ -33,7 +33,7 @@ class ArmParts(Config):
 
     Attributes:
         base: Link that the arm stands on.
-        joints: Of the arm, from the shoulder.
+        joints: Joints of the arm, from the shoulder.
         flange: Link that the last of them moves; it carries the hand, cameras and boards.
         hand: Link that the fingers move on.
         tcp: Link of the tool centre point: z out of the fingers, y the opening direction.
@@ -138,7 +138,7 @@ def choose_robot(name: str | None) -> None:
     """Let the robot of this process, and of those that it starts, be another one; None leaves it.
 
     Args:
-        name: Of a folder of `models/robots`, or the path of a robot's folder elsewhere.
+        name: Name of a folder of `models/robots`, or the path of a robot's folder elsewhere.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the robots there are.

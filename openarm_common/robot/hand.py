@@ -76,7 +76,7 @@ class Hand:
 
     Attributes:
         joint: That drives them.
-        sign: Of its positions, against those of `parts`.
+        sign: Sign of its positions, against those of `parts`.
         parts: Measures; the opening is that of the reach.
         reach: As it was learned; None: the drawing stands for it.
     """

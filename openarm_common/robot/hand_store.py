@@ -30,7 +30,7 @@ class HandStore(RecordStore[StoredHands]):
     """The hands of robots, below a folder of calibrations.
 
     Args:
-        folder: Of the calibrations.
+        folder: Folder of the calibrations.
     """
 
     def __init__(self, folder: Path) -> None:

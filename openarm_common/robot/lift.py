@@ -19,7 +19,7 @@ class LiftParts(Config):
         home: Position in which the simulation starts, m.
         stiffness: Position gain of the simulated drive, N/m; one with a spindle hardly gives.
         damping: Velocity gain, N s/m.
-        acceleration: Of plans, m/s2; their velocity is that of the URDF.
+        acceleration: Acceleration of plans, m/s2; their velocity is that of the URDF.
         jerk: Of plans, m/s3.
     """
 

@@ -68,7 +68,7 @@ class BusRange(_ByJoint):
     """Ranges that the numbers of a bus divide: 16 bits the position, 12 bits velocity and torque.
 
     Attributes:
-        position: Of every joint, +-rad.
+        position: Position of every joint, +-rad.
         velocity: +-rad/s.
         torque: +-N m.
     """

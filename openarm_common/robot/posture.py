@@ -73,9 +73,9 @@ class PostureTracker:
         Args:
             t_ns: Its stamp.
             names: Joints.
-            positions: Of each, rad or m.
+            positions: Positions of each, rad or m.
             now: When it arrived, s.
-            velocities: Of each, rad/s or m/s, where they are measured.
+            velocities: Velocities of each, rad/s or m/s, where they are measured.
         """
         self._received_at = now
         self.buffer.add_joint_state(t_ns, names, positions, velocities)

@@ -77,9 +77,9 @@ class RobotStateBuffer:
 
         Args:
             t_ns: Stamp.
-            names: Of the joints.
-            positions: Of each joint, rad or m.
-            velocities: Of each joint, rad/s or m/s; none, only zeros or NaN: they are not measured.
+            names: Names of the joints.
+            positions: Positions of each joint, rad or m.
+            velocities: Velocities of each joint, rad/s or m/s; none, only zeros or NaN: they are not measured.
         """
         if self._states and t_ns < self._states[-1].t_ns:
             self._states.clear()

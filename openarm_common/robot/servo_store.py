@@ -45,7 +45,7 @@ class ServoStore(RecordStore[StoredServos]):
     """The servos of arms, below a folder of calibrations.
 
     Args:
-        folder: Of the calibrations.
+        folder: Folder of the calibrations.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -47,7 +47,7 @@ class ArmLoad:
 
     Args:
         description: The robot.
-        joints: Of the arm, from the shoulder.
+        joints: Joints of the arm, from the shoulder.
         tool: Link in whose origin a held mass is.
     """
 

@@ -57,9 +57,9 @@ class Work(Config):
     """Where a robot works.
 
     Attributes:
-        table: Of scenes that say nothing else.
+        table: Table of scenes that say nothing else.
         least_x: Of the front edge of any table: one that reaches further back would stand in the robot.
-        region: Of objects.
+        region: Region of objects.
         hand_over: None with one arm.
     """
 

@@ -34,7 +34,7 @@ class ZeroStore(RecordStore[StoredZeros]):
     """The zeros of the joints, below a folder of calibrations.
 
     Args:
-        folder: Of the calibrations.
+        folder: Folder of the calibrations.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -226,7 +226,7 @@ class ActionClient(action.ActionClient):
     Args:
         node: Owner.
         kind: Type of the action.
-        name: Of the action.
+        name: Name of the action.
     """
 
     def __init__(self, node: Node, kind: Any, name: str) -> None:
@@ -273,7 +273,7 @@ def check_alive(died: Callable[[], str], what: str, code: Code = Code.NOT_READY)
     Args:
         died: Of `ActionClient.watch`.
         what: Was asked of it.
-        code: Of the error.
+        code: Code of the error.
 
     Raises:
         OpenArmError: Naming the node.

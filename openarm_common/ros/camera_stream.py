@@ -29,7 +29,7 @@ def camera_topics(camera: str, **topics: str) -> dict[str, tuple[type, str]]:
 
     Args:
         camera: Its name, filled in for {camera}.
-        topics: Of the streams.
+        topics: Topics of the streams.
     """
     named = {stream: topic.format(camera=camera) for stream, topic in topics.items()}
     return {stream: (CameraInfo if stream == "info" else _kind(topic), topic) for stream, topic in named.items()}
@@ -44,7 +44,7 @@ class CameraStream:
 
     Args:
         node: That subscribes.
-        states: Of the robot; None: frames need no posture.
+        states: States of the robot; None: frames need no posture.
         topics: Message type and topic of each stream.
         frame_id: Coordinate frame that every message must have; empty: any.
         pose_of: As for `FrameStream`.

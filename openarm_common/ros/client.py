@@ -49,7 +49,7 @@ class ContextNode:
     Nothing spins it but `spin_until`. Ctrl-C stays the caller's.
 
     Args:
-        name: Of the node; names that begin with _ are hidden.
+        name: Name of the node; names that begin with _ are hidden.
         domain: ROS_DOMAIN_ID; None takes the environment's.
         bare: Without parameter services and /rosout.
         context: Of `new_context`, where several nodes share one; it stays when this node is closed.
@@ -118,7 +118,7 @@ class BackgroundNode(ContextNode):
     """A node that spins in a thread of its own: its methods block, and answers are awaited with deadlines.
 
     Args:
-        name: Of the node.
+        name: Name of the node.
         domain: ROS_DOMAIN_ID; None takes the environment's.
         timeout: Longest wait for a server to be there, s of wall clock.
     """
@@ -185,7 +185,7 @@ class BackgroundNode(ContextNode):
 
         Args:
             kind: Type of the action.
-            name: Of the action.
+            name: Name of the action.
             goal: To send.
             timeout: Longest wait for the end, s of wall clock; then, and at any exception, the goal is cancelled, and
                 its end is waited for.

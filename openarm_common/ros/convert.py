@@ -128,7 +128,7 @@ def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int, basel
     """Make the CameraInfo of a camera without distortion.
 
     Args:
-        intrinsics: Of the camera.
+        intrinsics: Intrinsics of the camera.
         frame_id: Optical frame.
         t_ns: Stamp.
         baseline: From the left camera of a stereo pair to this one, its right one, m; 0 of others.
@@ -173,7 +173,7 @@ def cloud_from_fields(names: Sequence[str], data: Floats, frame_id: str, t_ns: i
     """Make a PointCloud2 of float32 fields (n, k) or, organised, (height, width, k); the first three are x, y, z, m.
 
     Args:
-        names: Of the fields, (k,).
+        names: Names of the fields, (k,).
         data: Their values.
         frame_id: Frame of the points.
         t_ns: Stamp.

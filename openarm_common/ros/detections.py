@@ -50,7 +50,7 @@ def detections_to_msg(
     Args:
         detections: In the frame.
         covariances: (6, 6) of the pose of each: x, y, z, roll, pitch, yaw, m and rad.
-        frame_id: Of the poses.
+        frame_id: Frame of the poses.
         t_ns: Stamp of the image.
     """
     message = Detection3DArray(header=header(frame_id, t_ns))

@@ -37,7 +37,7 @@ class WaitSetExecutor(Executor):
     """Runs callbacks in the thread that spins, as `rclpy.executors.SingleThreadedExecutor`.
 
     Args:
-        context: Of the nodes; None: the default one.
+        context: Context of the nodes; None: the default one.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:
@@ -185,7 +185,7 @@ class _Kept:
     Args:
         nodes: Whose entities are waited for.
         guards: Guard conditions of the executor.
-        context: Of both.
+        context: Context of both.
     """
 
     def __init__(self, nodes: Iterable[Any], guards: Iterable[Any], context: Context) -> None:

@@ -28,7 +28,7 @@ class Holder:
     """Announces what one client of the arms holds.
 
     Args:
-        node: Of the client.
+        node: Node of the client.
     """
 
     def __init__(self, node: BaseNode[Any]) -> None:
@@ -68,7 +68,7 @@ class HoldListener:
     """Hears which arms are held; methods as `ArmHolds`.
 
     Args:
-        node: Of what executes motions.
+        node: Node of what executes motions.
     """
 
     def __init__(self, node: BaseNode[Any]) -> None:

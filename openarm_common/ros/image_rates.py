@@ -22,7 +22,7 @@ class WantedRates:
     """Knows who subscribes to images, and how many of them each takes.
 
     Args:
-        node: Of the publishers of the images; an executor that spins it does not see this.
+        node: Node of the publishers of the images; an executor that spins it does not see this.
     """
 
     def __init__(self, node: Node) -> None:

@@ -352,7 +352,7 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
         source: Name of a file in `models/scenes` or in `scenes` of the robot's folder, which has precedence, a path
             ending in .yaml, "random", or `calibration_CAMERA`: the board for a camera, in the last arm's hand if it is
             fixed (`calibration_CAMERA_NAME_arm`: in another one's).
-        seed: Of a random scene.
+        seed: Seed of a random scene.
 
     Raises:
         OpenArmError: SCENE_INVALID, with the faults, or listing the scenes there are.

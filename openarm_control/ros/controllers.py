@@ -34,10 +34,10 @@ class Controllers:
     Args:
         node: Owner.
         loop: Whose thread runs them.
-        controller: Of all joints.
+        controller: Controller of all joints.
         servos: By which it carries the arms.
         gripper_action: Type of `gripper_cmd`.
-        prefix: Of the names of the actions and topics of arms and grippers.
+        prefix: Prefix of the names of the actions and topics of arms and grippers.
     """
 
     def __init__(

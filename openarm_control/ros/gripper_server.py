@@ -39,7 +39,7 @@ class GripperServer(ControllerServer[GripperOutcome]):
 
     Args:
         node: Owner.
-        prefix: Of its name.
+        prefix: Prefix of its name.
         side: left or right.
         gripper: Its controller.
         loop: Whose thread runs the controller.

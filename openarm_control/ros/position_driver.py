@@ -37,7 +37,7 @@ class PositionDriver:
         controller: Whose joints they are.
         arm_topic: Of position commands of an arm; {arm} stands for its side.
         gripper_topic: The same of a gripper.
-        prefix: Of the topic on which joint states are passed on.
+        prefix: Prefix of the topic on which joint states are passed on.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
 
     Args:
         node: Owner.
-        prefix: Of its names.
+        prefix: Prefix of its names.
         side: left or right.
         arm: Its controller.
         loop: Whose thread runs the controller.

@@ -59,7 +59,7 @@ def run_campaign(
 
     Args:
         options: What is run.
-        folder: Of the campaign.
+        folder: Folder of the campaign.
         on_row: Called with each new row.
         on_begin: Called with the number of rows that are there already.
         runner: Runs the seeds; None does it in this process, or in processes of this or other machines.

@@ -99,7 +99,7 @@ def with_servos(task: Task, options: CampaignOptions, folder: Path) -> tuple[Tas
     Args:
         task: The task.
         options: Of the campaign; None for the servos where they are not identified, or need not be: they carry the arm.
-        folder: Of identifications; those that it lacks are made.
+        folder: Folder of identifications; those that it lacks are made.
     """
     seed = options.dynamics_seeds[task.seed % len(options.dynamics_seeds)]
     task = replace(task, dynamics_seed=seed)

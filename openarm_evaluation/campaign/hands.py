@@ -30,8 +30,8 @@ def with_hands(task: Task, options: CampaignOptions, folder: Path) -> tuple[Task
 
     Args:
         task: The task.
-        options: Of the campaign; without seeds of hands, they are as drawn, and nothing is learned.
-        folder: Of learned hands; those that it lacks are learned.
+        options: Options of the campaign; without seeds of hands, they are as drawn, and nothing is learned.
+        folder: Folder of learned hands; those that it lacks are learned.
     """
     if not options.hand_seeds:
         return task, {}

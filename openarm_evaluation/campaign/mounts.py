@@ -50,7 +50,7 @@ def with_mounts(
     Args:
         task: The task.
         mount_seeds: To go through.
-        folder: Of calibrations; those that it lacks are made.
+        folder: Folder of calibrations; those that it lacks are made.
         hardware: Of the robot that calibrates.
     """
     seed = mount_seeds[task.seed % len(mount_seeds)]
@@ -81,7 +81,7 @@ class Bench:
 
     Args:
         camera: Which.
-        seed: Of the true mounts.
+        seed: Seed of the true mounts.
         zeros: What is added to true joint positions, rad by name.
         arm: That holds the board of a fixed camera; "": the last one.
     """

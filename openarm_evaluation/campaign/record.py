@@ -36,7 +36,7 @@ class Keeper:
 
     Args:
         robot: That the task runs on.
-        folder: Of this task.
+        folder: Folder of this task.
     """
 
     def __init__(self, robot: SimRobot, folder: Path) -> None:

@@ -119,14 +119,14 @@ class SimRobot:
     Args:
         scene: What is on the table.
         senses: How well it sees.
-        mount_seed: Of the true camera mounts; None mounts them where the configuration says.
+        mount_seed: Seed of the true camera mounts; None mounts them where the configuration says.
         mounts: T_parent_link by camera as the suite believes; those left out are nominal.
-        dynamics_seed: Of motors, masses and joint zeros; None: that of the configuration.
-        hand_seed: Of stops and friction of the fingers; None: that of the configuration.
+        dynamics_seed: Seed of motors, masses and joint zeros; None: that of the configuration.
+        hand_seed: Seed of stops and friction of the fingers; None: that of the configuration.
         hands: As they were learned, by arm; the drawing stands for those left out.
-        servos: Of the arms as identified, by side; None: as the profile says.
+        servos: Servos of the arms as identified, by side; None: as the profile says.
         table: As the suite believes; None: as it is.
-        seed: Of the noise.
+        seed: Seed of the noise.
         posture: Joints that start elsewhere than at home, rad by name.
     """
 

@@ -64,7 +64,7 @@ def read_lines(path: Path, kind: type[CompareRow]) -> tuple[list[dict[str, Any]]
     """Read rows; the last line may be cut short.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         kind: What has to be in each row.
 
     Returns:

@@ -58,7 +58,7 @@ class Trials:
         senses: How well the robot sees.
         config: Parameters of the grasp.
         mounts: T_parent_link by camera as the suite believes.
-        servos: Of the arms as identified, by side; None: as the profile says.
+        servos: Servos of the arms as identified, by side; None: as the profile says.
         hands: As they were learned, by arm.
         folder: Gets what is kept of a failure.
         again: The command that runs this task again, for the report.
@@ -271,8 +271,8 @@ def with_robot(
 
     Args:
         task: The task.
-        options: Of the campaign.
-        folder: Of the campaign; what it lacks of calibrations, identifications and learned hands is made.
+        options: Options of the campaign.
+        folder: Folder of the campaign; what it lacks of calibrations, identifications and learned hands is made.
     """
     mounts: Mapping[str, Array] = {}
     servos: Mapping[str, ServoModel] | None = None

@@ -135,7 +135,7 @@ def claims(track: Sequence[Sample], success: bool, outcome: str, place: Sequence
     Args:
         track: Of the object that was asked for, from before the request until it is at rest.
         success: What the answer claims.
-        outcome: Of the answer, as `GraspResult.outcome`; "" when no answer came.
+        outcome: Outcome of the answer, as `GraspResult.outcome`; "" when no answer came.
         place: Where the answer says it was placed.
     """
     found: list[Violation] = []

@@ -108,7 +108,7 @@ def rounds(seed: int, kinds: Sequence[str], nodes: Sequence[str], arms: Sequence
     """Yield requests and their faults without end; every kind comes once before any comes again, and so does each node.
 
     Args:
-        seed: Of all draws.
+        seed: Seed of all draws.
         kinds: Of faults; none: only requests.
         nodes: That may be killed and stopped.
         arms: Of the robot; every other request or so is for a particular one.

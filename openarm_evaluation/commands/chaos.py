@@ -32,7 +32,7 @@ def chaos(
 
     Args:
         minutes: How long; a request that has begun is finished.
-        seed: Of scenes, requests and faults.
+        seed: Seed of scenes, requests and faults.
         faults: Kinds of faults: kill, stop, commands, services, disk, camera, joints, detector, plans, intruder,
             rival; all when not given; none.
         rounds: Requests at most.

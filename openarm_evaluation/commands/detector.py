@@ -37,7 +37,7 @@ def data(*, out: Path = DATA, train: int = 4000, select: int = 400, report: int 
         train: Pictures for training.
         select: Pictures that choose the best weights.
         report: Pictures for the report, of which nothing else knows.
-        seed: Of all of them; same seed, same pictures.
+        seed: Seed of all of them; same seed, same pictures.
     """
     from openarm_evaluation.detector.data import DataConfig, make_data, write_sheet
 
@@ -74,9 +74,9 @@ def train(
         rate: Learning rate; 1e-3 with few pictures of your own.
         batch: Pictures a batch.
         threads: Of torch.
-        seed: Of weights, order and variations.
+        seed: Seed of weights, order and variations.
         first: Weights to begin with: the best.pt of another run of the same classes.
-        name: Of the ONNX files.
+        name: Name of the ONNX files.
     """
     for module in ("torch", "onnx"):
         if find_spec(module) is None:

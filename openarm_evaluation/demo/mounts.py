@@ -64,7 +64,7 @@ def errors(mount_seed: int, *, nominal: bool) -> dict[str, dict[str, float]]:
     """How far off the mounts of the configuration and those in use are, mm and degrees, by camera.
 
     Args:
-        mount_seed: Of the true mounts.
+        mount_seed: Seed of the true mounts.
         nominal: Whether the mounts of the configuration are in use, whatever is stored.
     """
     stores = places(default_folder(), mount_seed)

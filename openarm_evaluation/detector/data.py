@@ -47,7 +47,7 @@ def make_data(folder: Path, config: DataConfig, progress: Callable[[str, int], N
     """Render the sets into a folder; pictures that are there already are kept, so that it goes on where it stopped.
 
     Args:
-        folder: Of the data set.
+        folder: Folder of the data set.
         config: How many, and the seed.
         progress: Called after each picture with its set and number.
 

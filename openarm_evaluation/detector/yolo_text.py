@@ -32,8 +32,8 @@ def read_labels(text: str, width: int, height: int, classes: int, where: str) ->
 
     Args:
         text: Lines of `class cx cy width height`.
-        width: Of the picture, pixels.
-        height: Of the picture, pixels.
+        width: Width of the picture, pixels.
+        height: Height of the picture, pixels.
         classes: How many there are.
         where: Prefix of every fault, such as the path of the file.
 

@@ -38,7 +38,7 @@ class Film:
     A film runs at the pace of simulated time: a frame that comes late is shown until the next.
 
     Args:
-        path: Of the video (.mp4).
+        path: Path of the video (.mp4).
         fps: Frames a second of simulated time.
     """
 

@@ -267,7 +267,7 @@ class _Grid:
         full: Voxels that the object is in.
         sums: Sums of `full` from the first corner.
         sums_behind: Sums over x and y of voxels that have the object in them or behind them.
-        centre: Of mass (3,), m.
+        centre: Centre of mass (3,), m.
     """
 
     ends: Array

@@ -47,7 +47,7 @@ class Trial:
 
     Args:
         scene: What was on the table.
-        seed: Of the scene.
+        seed: Seed of the scene.
         target: Name of the object; "" when the scene has none of the label.
         answer: `GraspResult` of a client, or `GraspOutcome` in process.
         verdict: Of ground truth; None when the object could not be observed.
@@ -182,7 +182,7 @@ def run_trial(
         client: Requests the grasp.
         scene: What is on the table now.
         wanted: What to grasp and where to place it; without a label, the first object of the scene.
-        seed: Of the scene, for the report.
+        seed: Seed of the scene, for the report.
         after_ns: Ground truth up to this time is of an earlier scene.
         before: Called when the scene is at rest, before the grasp is requested.
         moved: Earlier grasps have moved its objects, so it is not waited for.

@@ -99,7 +99,7 @@ def shell(outer: Profile, inner: Profile, color: Rgb, staves: int = _STAVES) -> 
         outer: (radius, z) from the bottom to the rim.
         inner: The same of the inside, with as many rows; the first is the floor. A first radius of outer and inner at
             one height makes a tube, without a floor.
-        color: Of all.
+        color: Colour of all.
         staves: Convex parts of a row of the wall.
     """
     floor = inner[0][1] > outer[0][1] + 1e-6
@@ -139,7 +139,7 @@ def tube(
     Args:
         path: (n, 3) m.
         radii: (n,), or (n, 2) along `up` and across it; or one for all.
-        color: Of all.
+        color: Colour of all.
         up: A direction that is never that of the path.
         closed: The last point is joined to the first.
         around: Facets.

@@ -30,11 +30,11 @@ def write_sheet(
     """Draw objects in rows on one table.
 
     Args:
-        path: Of the PNG.
+        path: Path of the PNG.
         sources: As `openarm_common.objects.model.load_object`.
         side: That each rests on; its last one where it has fewer.
         parts: Draw the convex parts instead of what is seen.
-        seed: Of lamps, table and paper; None: plain.
+        seed: Seed of lamps, table and paper; None: plain.
 
     Raises:
         OpenArmError: As `load_object`; ENVIRONMENT without OpenGL.

@@ -80,7 +80,7 @@ class DriftWatch:
         """Take one measurement.
 
         Args:
-            arm: Whose hand placed the object.
+            arm: Arm whose hand placed the object.
             direction: (2,) unit vector in which the error was measured, base frame.
             residual: Seen less true along it, m.
         """

@@ -41,10 +41,10 @@ class Evidence:
         gap: Distance between the fingers, m (twice the position of one finger).
         expected: Width of the object between them, m.
         effort: Force of the finger actuator, N, any sign.
-        speed: Of the gap, m/s, any sign.
+        speed: Speed of the gap, m/s, any sign.
         tcp_error: Distance of the TCP from the planned grasp, m.
         pads: Force on each finger pad, N; empty without a sensor.
-        reach: Of this hand, where it was learned.
+        reach: Reach of this hand, where it was learned.
     """
 
     gap: float
@@ -254,12 +254,12 @@ def judge_place(
     What has turned onto a face of the same size looks as before: that no camera sees.
 
     Args:
-        label: Of the object.
+        label: Label of the object.
         p_target: (3,) where its footprint centre should stand, base frame, m; z is that of the table.
         frames: Taken after the arm has left; the newest that shows the object counts.
         tolerance: Largest horizontal distance, m.
-        yaw: Of its x axis, where one was asked for, rad; what looks square or round is not judged by it.
-        height: Of the object as it stood, m: one of another height lies on its side. None: it is not judged.
+        yaw: Yaw of its x axis, where one was asked for, rad; what looks square or round is not judged by it.
+        height: Height of the object as it stood, m: one of another height lies on its side. None: it is not judged.
         footprint: (2,) edges of the object as it stood, m: one that leans shows larger ones. None: they are not judged.
     """
     if not frames:

@@ -129,8 +129,8 @@ def tcp_height(height: float, tilt: float, hand: HandParts) -> float:
     The largest of three: the finger tips clear the surface, the pads meet the object's middle, the palm clears its top.
 
     Args:
-        height: Of the object, m.
-        tilt: Of the approach from straight down, rad.
+        height: Height of the object, m.
+        tilt: Tilt of the approach from straight down, rad.
         hand: Measures of the gripper.
     """
     tips = tips_height(tilt, hand)
@@ -242,7 +242,7 @@ def shorter(candidate: GraspCandidate, share: float = _SHORT) -> GraspCandidate:
 
     Args:
         candidate: A grasp.
-        share: Of the way to the grasp; the lift is shortened to five eighths at most.
+        share: Share of the way to the grasp; the lift is shortened to five eighths at most.
     """
     return replace(
         candidate,
@@ -265,7 +265,7 @@ def turned(candidate: GraspCandidate, axis: str, angle: float, hand: HandParts) 
 
     Args:
         candidate: A grasp.
-        axis: Of the hand: x, y (the closing axis) or z (the approach).
+        axis: Axis of the hand: x, y (the closing axis) or z (the approach).
         angle: rad.
         hand: Measures of the gripper: the tips stay as high above the table.
     """

@@ -53,7 +53,7 @@ class FeasibilityCheck:
             arm: Whose.
             found: The object and its neighbours.
             place: Footprint centre (x, y), base frame, m; None: the grasp alone is planned.
-            yaw: Of the object there; None: unconstrained.
+            yaw: Yaw of the object there; None: unconstrained.
             now: The object where it stands until then, when that is elsewhere; for a grasp alone.
             offered: Grasps of it there; None: they are searched.
 
@@ -95,7 +95,7 @@ class FeasibilityCheck:
             arm: Whose.
             found: The object and its neighbours.
             spots: (2,) footprint centres, best first.
-            yaw: Of the object there; None: unconstrained.
+            yaw: Yaw of the object there; None: unconstrained.
             used: Ways to put it down that are of no use.
 
         Raises:

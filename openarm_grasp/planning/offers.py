@@ -28,7 +28,7 @@ def offers(
 
     Args:
         context: Parameters, hands, where the arms stand.
-        arm: Whose hand.
+        arm: Arm of the hand.
         sighting: The object and what is around it.
         failed: Grasps of it that have failed.
 

@@ -21,7 +21,7 @@ class NoWayError(OpenArmError):
     """The planner refused every way that it was offered.
 
     Args:
-        code: Of the one that got furthest.
+        code: Code of the one that got furthest.
         message: Its reason, which represents the others.
         refusals: Why each was refused, by id.
     """
@@ -40,8 +40,8 @@ class Option:
     """One way to take hold of an object with an arm.
 
     Attributes:
-        id: Of the candidate; label and edge for an edge that the hand does not fit across.
-        arm: Whose hand.
+        id: Id of the candidate; label and edge for an edge that the hand does not fit across.
+        arm: Arm of the hand.
         score: The higher is preferred; the sum of `parts`.
         parts: What the score is made of.
         limit_margin: How near it comes to a joint limit on the way down and up again, rad; NaN: not known.

@@ -46,7 +46,7 @@ def place_targets(
         spots: (2,) or (3,) footprint centres, base frame, m, best first; z is not read.
         config: Parameters.
         used: Targets that have failed before: their spots (where there are others) or turns come last.
-        yaw: Of the object's x axis about the base z when it stands there, rad; None: any.
+        yaw: Yaw of the object's x axis about the base z when it stands there, rad; None: any.
     """
     T_object_tcp = se3.inverse(target.T_base_object) @ candidate.T_base_tcp
     yaws = yaw_offsets(config.place.yaw_step_deg) if yaw is None or target.round else turns_to(target, yaw)
@@ -163,7 +163,7 @@ def free_spots(
     twice the distance asked for) and nearness to where it came from, which keeps the carry short.
 
     Args:
-        arm: Whose side.
+        arm: Arm whose side.
         target: The object as it stood at the grasp.
         others: Other objects in view.
         config: Parameters.
@@ -274,7 +274,7 @@ def placing_error(label: str, target: PlaceTarget, frame: Frame) -> tuple[Array,
     """How far the camera sees a placed object from where the hand let it go, along the opening axis of the hand.
 
     Args:
-        label: Of the object.
+        label: Label of the object.
         target: Where it was let go.
         frame: Observed since.
 

@@ -150,7 +150,7 @@ def _line(
         things: (n, 3) columns of each; x along the line.
         half: Of the width that the hand takes, m.
         room: Free length that it needs to come down, m.
-        length: Of the way of the first thing, m.
+        length: Length of the way of the first thing, m.
 
     Returns:
         Where what the hand meets begins; where the first thing begins and ends; which are moved. None when the hand
@@ -311,7 +311,7 @@ def _front(points: Array, ahead: Array, half_width: float, height: tuple[float, 
         points: (n, 3) of the hand's surface, axes of the base, from the TCP.
         ahead: (3,) direction.
         half_width: Of the object, across that direction, m.
-        height: Of the object's lower and upper face above the TCP, m.
+        height: Height of the object's lower and upper face above the TCP, m.
     """
     across = np.abs(points @ np.cross(UP, ahead))
     low, high = height

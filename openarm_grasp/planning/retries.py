@@ -46,7 +46,7 @@ class FailedGrasp:
 
     Attributes:
         code: Why.
-        arm: Whose hand.
+        arm: Arm of the hand.
         R_base_tcp: (3, 3) orientation of the hand.
         offset: (3,) of its TCP from the middle of the object's lower face.
         heavy: (2,) direction of the end of the object that hung lower than it should; None: not seen.

@@ -119,7 +119,7 @@ class _InVain:
 
     Attributes:
         request: What was asked for.
-        code: Of the answer.
+        code: Code of the answer.
         touched: An arm has moved for it.
         seen: The object was seen.
     """
@@ -272,8 +272,8 @@ class Order:
 
         Args:
             request: From `next`.
-            code: Of the answer.
-            message: Of the answer.
+            code: Code of the answer.
+            message: Message of the answer.
             placed: (x, y) where the object stands now, when it was placed.
             seen: (x, y) where it was seen last, when it was.
             touched: An arm has moved for it.

@@ -16,7 +16,7 @@ class StateTime:
 
     Attributes:
         state: Its name.
-        duration: Of all visits, s.
+        duration: Duration of all visits, s.
         budget: Of a visit, s; 0: none.
         longest: Visit, s, without the time that a person took to confirm a plan.
     """

@@ -41,7 +41,7 @@ class Grasp:
     """A grasp that was chosen.
 
     Attributes:
-        arm: Whose hand.
+        arm: Arm of the hand.
         sighting: The object and its neighbours before the grasp.
         candidate: How the hand takes hold.
         places: Ways to put the object down.
@@ -167,7 +167,7 @@ class GraspSession:
 
         Args:
             robot: Carries out.
-            arm: Whose hand; "": of the one arm that holds something.
+            arm: Arm of the hand; "": of the one arm that holds something.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, for no arm or when both hold something; NOT_READY, when no hand does.
@@ -222,7 +222,7 @@ class Status:
         previous: The state before.
         reason: Why it was entered.
         attempt: 1-based number of the attempt, 0 when none runs.
-        label: Of the object, "" while none is known.
+        label: Label of the object, "" while none is known.
         arm: The arm in use, "" while none is chosen.
         request: Which of the requests that run at the same time, 0 or 1.
         failed: The attempt, or what was observed for it, has failed.
@@ -230,7 +230,7 @@ class Status:
         chosen: Id of the one that was chosen, or "".
         refused: Ids of those that were refused.
         plan: That waits for a person.
-        code: Of the request, when it has ended.
+        code: Code of the request, when it has ended.
         budget: Longest time that this state is expected to take, s; 0: none.
         late: That the state before took longer than expected, or "".
     """

@@ -79,8 +79,8 @@ class Planned:
         limit_margins: Of each way, how near it comes to a joint limit, rad; NaN: refused or not evaluated. Empty when
             the planner does not say.
         start: Joints at its beginning, rad by name.
-        duration: Of the three, s.
-        scene_version: Of the planning scene that it was planned in.
+        duration: Duration of the three, s.
+        scene_version: Version of the planning scene that it was planned in.
     """
 
     chosen: int

@@ -23,7 +23,7 @@ async def learn_hand(robot: Skills, arm: str, settle: float) -> HandReach:
 
     Args:
         robot: Carries out.
-        arm: Whose hand.
+        arm: Arm of the hand.
         settle: Longest wait for the fingers to rest, s.
 
     Raises:

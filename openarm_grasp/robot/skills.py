@@ -236,7 +236,7 @@ class Skills:
 
         Args:
             arm: Which.
-            trajectory: Of the planner.
+            trajectory: Trajectory of the planner.
             what: For errors, for example "lift".
             carrying: A hand that closes or slips stops it.
             line: Ends (3,) of the straight line that the TCP follows, base frame, m; leaving it by more than
@@ -395,7 +395,7 @@ class Skills:
         """Open the hand.
 
         Args:
-            arm: Whose hand.
+            arm: Arm of the hand.
             what: For errors, for example "release".
             aperture: Distance between the fingers, m; None: wide open.
             held: Gap at which it holds something, m: `lets_go` more is enough, as other things may stop the fingers.
@@ -427,7 +427,7 @@ class Skills:
         """Close the hand until it presses on something.
 
         Args:
-            arm: Whose hand.
+            arm: Arm of the hand.
             what: For errors, for example "close".
             force: Largest, N; 0: the driver's limit.
 
@@ -446,7 +446,7 @@ class Skills:
         """Read the gripper at rest.
 
         Args:
-            arm: Whose hand.
+            arm: Arm of the hand.
             expected: Width between the fingers, m.
             T_base_tcp: (4, 4) planned pose that the TCP error is measured against; None leaves the error 0.
             settle: Longest wait for the fingers to rest, s.

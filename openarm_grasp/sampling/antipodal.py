@@ -70,7 +70,7 @@ class Antipodal:
         width: Extent between the pads, m.
         apertures: Least and greatest aperture that the closed hand may have, m.
         patch_area: Of the smaller patch, m2.
-        tilt: Of the approach from straight down, rad.
+        tilt: Tilt of the approach from straight down, rad.
         score: The sum of `parts`.
         parts: What it is made of.
         opened: Aperture of the hand on its approach, m; None: wide open.
@@ -105,8 +105,8 @@ class Search:
 
     Args:
         surface: Where.
-        shape: Of the hand.
-        config: Of the search.
+        shape: Shape of the hand.
+        config: Parameters of the search.
         approach: Distance and tilts.
         field: Distances to obstacles; read where the surface knows nothing.
         centre: (3,) centre of mass of the target, base frame; None: of its volume.

@@ -318,7 +318,7 @@ def search(
         tips: (m, c, 3) by finger.
         opening: Finger of the open hand.
         finger_step: Between rows of `pads` and `tips`.
-        clearance: Of the hand over the table.
+        clearance: Clearance of the hand over the table.
         back: Length of the straight approach.
         centre: (3,) of mass.
         widest: Voxels.

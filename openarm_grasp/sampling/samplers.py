@@ -45,7 +45,7 @@ class Sampling:
         others: What stands around it.
         shoulder_xy: (2,) of the arm's shoulder in the base frame, m.
         surface: The object and what is around it, as cameras saw it; None: only the boxes are known.
-        shape: Of the open hand with the cameras that it carries; needed with a surface.
+        shape: Shape of the open hand with the cameras that it carries; needed with a surface.
         field: Distances to obstacles, base frame; read where the surface knows nothing.
         failed: Grasps of it that have failed.
     """

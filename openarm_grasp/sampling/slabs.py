@@ -35,7 +35,7 @@ def slabs(
     """Put upright boxes around points, cut where that saves most volume.
 
     Args:
-        label: Of the object; it names the boxes.
+        label: Label of the object; it names the boxes.
         points: (n, 3) middles of voxels.
         step: Edge of a voxel.
         gap: The boxes end this far above the lowest voxel, so that what stands on a table is not in collision with it.

@@ -39,7 +39,7 @@ class HandOver:
         giver: The arm that brings the object to the middle.
         taker: The arm that takes it from there.
         spot: (2,) where it stands in between.
-        yaw: Of its x axis there, rad.
+        yaw: Yaw of its x axis there, rad.
     """
 
     giver: str

@@ -31,7 +31,7 @@ class Height:
     """A height at which a grasp was planned.
 
     Attributes:
-        position: Of the lift, m.
+        position: Position of the lift, m.
         present: Where it is, m.
         arm: That grasps there.
         plan: Of the grasp.

@@ -39,7 +39,7 @@ class Push:
     """A push that was planned.
 
     Attributes:
-        arm: Whose hand.
+        arm: Arm of the hand.
         start: (2,) where the object stands.
         end: (2,) where it should stand afterwards.
         way: How the hand stands behind it, and its line.

@@ -27,8 +27,8 @@ class CameraNode(BaseNode[ConfigT]):
     Depth is aligned to colour, in mm. Pictures are without distortion, and become messages only while someone listens.
 
     Args:
-        name: Of the node.
-        model: Of its parameters.
+        name: Name of the node.
+        model: Model of its parameters.
         source: Makes the camera of the parameters.
         silent_s: As of `CameraFeed`.
         kwargs: Of the node.

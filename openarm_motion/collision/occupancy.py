@@ -54,7 +54,7 @@ class OccupancyMap:
     Attributes:
         indices: (n, 3) of the cells on the lattice.
         lattice: Which cells there are.
-        version: Of the map.
+        version: Version of the map.
     """
 
     indices: NDArray[np.int64]

@@ -16,7 +16,7 @@ class RegionGoal:
     Attributes:
         regions: Any of them will do.
         path: What every configuration on the way satisfies.
-        time_limit: Of the search, s; 0: the default.
+        time_limit: Time limit of the search, s; 0: the default.
     """
 
     regions: tuple[Region, ...]

@@ -31,7 +31,7 @@ def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0, end: f
         arm: The arm.
         region: Where.
         start: (n,) joints that are not constrained stay as here.
-        scale: Of velocity, see `StartState`.
+        scale: Scale of velocity, see `StartState`.
         end: After it, s of the monotonic clock, nothing else is drawn.
 
     Raises:

@@ -73,7 +73,7 @@ class StartState:
     Attributes:
         state: Positions of the robot's joints by name, rad or m; both arms and fingers.
         start: (n,) where the arm starts; usually its part of `state`.
-        scale: Of velocity, or of velocity and acceleration; 0 means the default.
+        scale: Scale of velocity, or of velocity and acceleration; 0 means the default.
         stopped: Whether the request was cancelled; asked often.
         environment: Bodies of the planning scene and the map.
         seeds: Added to that of the searches, one for each of them; the path that is followed soonest is taken.

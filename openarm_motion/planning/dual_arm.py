@@ -183,7 +183,7 @@ class DualArmGoals:
     """What both arms are asked.
 
     Attributes:
-        goals: Of each arm, configurations (k, n); any will do, an earlier one is preferred.
+        goals: Goals of each arm, configurations (k, n); any will do, an earlier one is preferred.
         obstacles: Boxes, base frame.
         held: Boxes that each arm holds, tool frame.
     """

@@ -25,7 +25,7 @@ class Alternative:
     Attributes:
         q: (n,) rad.
         pose: (4, 4) of the tool there, base frame, m.
-        distance: Of the tool from where it was asked to be, m.
+        distance: Distance of the tool from where it was asked to be, m.
     """
 
     q: Array

@@ -48,7 +48,7 @@ class PlanQuery:
         time_limit: Wall clock, s.
         iterations: Samples of the search, in place of the time limit; 0 leaves it to the time. The same query then ends
             the same way on a busy machine.
-        seed: Of the random numbers: the same query gives the same path.
+        seed: Seed of the random numbers: the same query gives the same path.
         stopped: Asked often; planning ends with CANCELLED when it says True.
         fast: Makes the fast layer's view of the same; None leaves the two questions above.
         resolution: Turn of a joint (rad) and travel of a point (m) between two checks of a line.

@@ -92,7 +92,7 @@ def grow(
         model: The scene.
         work: Room.
         iterations: How many samples.
-        seed: Of the samples.
+        seed: Seed of the samples.
 
     Returns:
         The configuration of each tree at which they meet, -1 when they don't; and how many lines were checked.
@@ -199,7 +199,7 @@ def shorten(
         points: (m, n) with room for a few more than `count`.
         count: Way points.
         attempts: Random attempts.
-        seed: Of these.
+        seed: Seed of these.
         limits: (3, n) velocity, acceleration and jerk: a corner costs a stop.
         resolution: (2,) step (rad) and travel (m) between two checks.
         levers: (n,) m.

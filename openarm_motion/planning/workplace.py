@@ -68,7 +68,7 @@ def grasp_region(arms: Mapping[str, Arm], table: Table, state: Mapping[str, floa
     Args:
         arms: With the table; an arm that is alone grasps on both sides.
         table: That objects stand on.
-        state: Of the joints; arms that don't move stay there.
+        state: State of the joints; arms that don't move stay there.
 
     Raises:
         OpenArmError: UNREACHABLE, when there is none.
@@ -105,9 +105,9 @@ def postures(
     Args:
         arms: With the table.
         table: Under the hands.
-        region: Of objects.
+        region: Region of objects.
         eye: (3,) of the camera that sees them.
-        state: Of the joints that no arm has, such as fingers.
+        state: State of the joints that no arm has, such as fingers.
 
     Raises:
         OpenArmError: UNREACHABLE, when an arm has no free posture over the table.

@@ -34,7 +34,7 @@ class MotionResult(Answer):
 
     Attributes:
         trajectories: The plan, of each arm that was asked for; empty without one.
-        scene_version: Of the planning scene that it was made in; 0 for `execute`.
+        scene_version: Version of the planning scene that it was made in; 0 for `execute`.
         failure: Where and why there is no plan, and the nearest feasible goal, if any; None after a success.
     """
 

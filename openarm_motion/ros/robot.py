@@ -112,7 +112,7 @@ class Controller:
 
     Args:
         node: Owns the client.
-        name: Of the action.
+        name: Name of the action.
         goal_id: Makes the id of a goal.
     """
 

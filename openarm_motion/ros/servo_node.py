@@ -182,7 +182,7 @@ class _End:
 
     Args:
         node: Owner.
-        prefix: Of their names.
+        prefix: Prefix of their names.
         arms: That are commanded by them.
     """
 

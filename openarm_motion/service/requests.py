@@ -98,7 +98,7 @@ class MoveRequest:
         obstacles: Boxes, base frame.
         attached: Boxes held by the arm, tool frame; empty: what it is known to hold.
         hand_empty: It holds nothing: what it was known to hold is forgotten.
-        scale: Of velocity, or of velocity and acceleration; 0: the default.
+        scale: Scale of velocity, or of velocity and acceleration; 0: the default.
         plan_only: Do not move.
         max_start_delay: Longest wait for clearance next to an arm under way, s.
         scene_version: That the planning scene must have; 0: any.
@@ -139,7 +139,7 @@ class MoveArmsRequest:
     """Plan, and unless `plan_only` execute, a dual-arm motion; attributes as in `MoveRequest`.
 
     Attributes:
-        time_limit: Of the search, s; 0: the default.
+        time_limit: Time limit of the search, s; 0: the default.
     """
 
     targets: tuple[ArmGoal, ...]
@@ -181,7 +181,7 @@ class MotionAnswer:
     Attributes:
         error: Why it failed.
         message: In a sentence.
-        scene_version: Of the planning scene that it was planned in.
+        scene_version: Version of the planning scene that it was planned in.
         planning_time: s.
         start_delay: How long the arm rested first for another arm under way, s.
     """

@@ -37,7 +37,7 @@ class MapServices:
         node: Its node.
         mapper: The map.
         depths: Further depths of the tree that are answered, below 16.
-        stamp: Of the newest image in the map, ns.
+        stamp: Stamp of the newest image in the map, ns.
         show: Publishes a map that a request has changed.
     """
 

@@ -29,7 +29,7 @@ class Source:
     """A stream of frames and what became of them.
 
     Args:
-        name: Of the camera or cloud.
+        name: Name of the camera or cloud.
         stream: Its frames.
         to_scan: Makes the scan of a frame; raises OpenArmError where it does not fit.
 
@@ -111,7 +111,7 @@ def depth_source(
 
     Args:
         node: That subscribes.
-        states: Of the robot.
+        states: States of the robot.
         camera: The camera.
         topics: `depth` and `info`, with {camera} for its name.
         joints: Whether the joints are needed, to cut the robot out.
@@ -132,8 +132,8 @@ def cloud_source(node: BaseNode[Any], states: RobotStateListener, topic: str, jo
 
     Args:
         node: That subscribes.
-        states: Of the robot.
-        topic: Of the clouds.
+        states: States of the robot.
+        topic: Topic of the clouds.
         joints: Whether the joints are needed, to cut the robot out.
     """
 

@@ -27,8 +27,8 @@ class Letterbox:
     """How an image lies in the input of a network; pixels.
 
     Attributes:
-        width: Of the input.
-        height: Of the input.
+        width: Width of the input.
+        height: Height of the input.
         left: Where the image begins.
         top: Where the image begins.
         inner: (width, height) that the image takes.

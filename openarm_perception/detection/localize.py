@@ -188,8 +188,8 @@ class Localizer:
 
         Args:
             found: In the colour image.
-            height: Of the object, m.
-            intrinsics: Of the camera.
+            height: Height of the object, m.
+            intrinsics: Intrinsics of the camera.
             T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image; any attitude.
 
         Raises:

@@ -106,7 +106,7 @@ class Pipeline:
         Args:
             rgb: (h, w, 3) uint8.
             depth: (h, w) uint16 millimetres or float32 metres, aligned with `rgb`.
-            intrinsics: Of both, from the CameraInfo.
+            intrinsics: Intrinsics of both, from the CameraInfo.
             T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image.
             robot: (h, w) pixels that show the robot or what it holds; they belong to no object.
             withheld: Why no object of the frame may be a target, from `CameraWatch`.
@@ -154,7 +154,7 @@ class Pipeline:
 
         Args:
             view: The frame.
-            block_height: Of the block, m; 0: by the surface.
+            block_height: Height of the block, m; 0: by the surface.
             label: Words for the block; empty: the only one in view.
 
         Raises:

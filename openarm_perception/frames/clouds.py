@@ -89,8 +89,8 @@ def read_cloud(
     Args:
         path: PCD, PLY, .npy or .xyz.
         limits: Depths that count when a camera is chosen.
-        unit: Of its coordinates.
-        axes: Of its frame.
+        unit: Unit of its coordinates.
+        axes: Axes of its frame.
         like: A cloud of the same place, whose camera is taken where this is no image.
 
     Raises:

@@ -36,7 +36,7 @@ class Frame:
     Attributes:
         points: (h, w, 3) float32 organised, optical frame, m; NaN where nothing was measured.
         rgb: (h, w, 3) uint8; None without colour.
-        intrinsics: Of both.
+        intrinsics: Intrinsics of both.
         assumed: Metres of a count of depth, where it is not said; None where that is known.
         lens: Lens of the depth image; None where points are of something else.
     """

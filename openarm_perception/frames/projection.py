@@ -76,7 +76,7 @@ def project(points: Points, lens: Intrinsics) -> tuple[Floats, Ints]:
 
     Args:
         points: (n, 3) float32, z forward, m.
-        lens: Of the camera.
+        lens: Lens of the camera.
 
     Returns:
         (h, w) float32, m, NaN where there is no point; and (h, w) the number of the point, -1 where there is none.

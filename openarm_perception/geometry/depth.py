@@ -88,7 +88,7 @@ class View:
     Attributes:
         rgb: (h, w, 3) uint8.
         depth: (h, w) uint16 millimetres or float32 metres, planar.
-        intrinsics: Of both.
+        intrinsics: Intrinsics of both.
         T_base_camera: (4, 4) optical frame in the base frame.
         robot: (h, w) pixels that show the robot or what it holds; None when it was not searched for.
     """
@@ -130,7 +130,7 @@ class Deprojector:
 
         Args:
             depth: (h, w), uint16 millimetres or float32 metres.
-            intrinsics: Of the camera, from its CameraInfo.
+            intrinsics: Intrinsics of the camera, from its CameraInfo.
             out: (h, w, 3) float32 to write to; a new array without it.
 
         Returns:

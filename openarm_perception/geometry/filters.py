@@ -93,7 +93,7 @@ def voxel_filter(points: Points, edge: float) -> Points:
 
     Args:
         points: (n, 3) float32; points that are not finite or further than 10^6 cells away are dropped.
-        edge: Of a cell, m; positive.
+        edge: Edge of a cell, m; positive.
     """
     size = 1 << max(4, int(2 * max(len(points), 1) - 1).bit_length())
     table = np.full(size, -1, np.int64)

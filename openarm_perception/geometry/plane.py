@@ -27,7 +27,7 @@ def intersect(
 
     Args:
         pixels: (u, v).
-        intrinsics: Of the camera, from its CameraInfo.
+        intrinsics: Intrinsics of the camera, from its CameraInfo.
         T_base_camera: (4, 4) optical frame in the base frame.
         normal: (3,) of the plane, of any length but zero.
         offset: `normal · p` of its points.
@@ -59,7 +59,7 @@ def outline(
 
     Args:
         found: The detection; its mask is the silhouette.
-        intrinsics: Of the camera.
+        intrinsics: Intrinsics of the camera.
         T_base_camera: (4, 4) optical frame in the base frame.
         bottom: Height of the table, m.
         top: Height of the object's top, m; below the camera.

@@ -30,11 +30,11 @@ class TableMeasurement:
     """A measured table.
 
     Attributes:
-        height: Of the plane in the middle of its points, m.
+        height: Height of the plane in the middle of its points, m.
         std: Rms distance of the points from the plane, m.
-        tilt: Of the plane against the horizontal, rad.
+        tilt: Tilt of the plane against the horizontal, rad.
         points: How many were used.
-        share: Of all points that were seen.
+        share: Share of all points that were seen.
     """
 
     height: float

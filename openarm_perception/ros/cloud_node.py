@@ -35,7 +35,7 @@ class _Camera:
 
     Args:
         node: That publishes them.
-        name: Of the camera.
+        name: Name of the camera.
         finder: Finds the robot in images; None: it stays in the cloud.
         publish: Takes each frame and its points; what raises is reported.
         merged: Whether they are for the merged cloud: valid points, and the pose of the camera is needed.

@@ -28,7 +28,7 @@ def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Det
 
     Args:
         found: In the image.
-        frame_id: Of the image.
+        frame_id: Frame of the image.
         t_ns: Stamp.
     """
     message = Detection2DArray(header=header(frame_id, t_ns))
@@ -61,7 +61,7 @@ def markers(located: Sequence[LocatedObject], frame_id: str, t_ns: int) -> Marke
 
     Args:
         located: In the frame.
-        frame_id: Of the poses.
+        frame_id: Frame of the poses.
         t_ns: Stamp.
     """
     message = MarkerArray(markers=[Marker(header=header(frame_id, t_ns), action=Marker.DELETEALL)])

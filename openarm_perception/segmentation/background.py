@@ -48,7 +48,7 @@ def nearer(points: Points, background: Points, noise: float, sigmas: float, leas
     Args:
         points: (h, w, 3), m.
         background: (h, w, 3), m; what has no depth there is not nearer.
-        noise: Of a depth at 1 m, m.
+        noise: Noise of a depth at 1 m, m.
         sigmas: By so many standard deviations.
         least: And by so much, m.
     """

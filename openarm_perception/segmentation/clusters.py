@@ -33,7 +33,7 @@ class Cluster:
         mask: (h, w) bool, its pixels within the window.
         points: (n, 3) float32 of those of its pixels that lie on a surface, without their noise, in row order, m; base
             frame, or the camera's where its pose is not known.
-        height: Of its highest place over the support, m.
+        height: Height of its highest place over the support, m.
         outline: What lies beyond its outline.
         shape: Whether a prism fits it.
         T_frame_box: (4, 4) middle of the box around it, in the frame of the points; z away from the support.
@@ -90,7 +90,7 @@ def segment(
 
     Args:
         points: (h, w, 3) float32, optical frame, m; NaN where nothing was measured.
-        intrinsics: Of the camera.
+        intrinsics: Intrinsics of the camera.
         config: What counts as a thing.
         rgb: (h, w, 3) uint8 aligned with it: clusters have a colour then.
         T_base_camera: (4, 4) optical frame in the base frame, whose z points up; None: the support may be slanted.

@@ -105,7 +105,7 @@ def divide(
 
     Args:
         points: (h, w, 3) organised, optical frame, m.
-        intrinsics: Of the camera.
+        intrinsics: Intrinsics of the camera.
         support: What things stand on.
         config: What counts as a thing.
         apart: (h, w) pixels of no thing, such as those of the robot.
@@ -163,7 +163,7 @@ def _filled(label: NDArray[np.uint16], z: NDArray[np.float32], pixel: float, noi
         label: (h, w), 0: none.
         z: (h, w) depth of what rises above the support, m; NaN elsewhere.
         pixel: Metres across of a pixel at 1 m.
-        noise: Of the depth at 1 m, m.
+        noise: Noise of the depth at 1 m, m.
     """
     kernel = np.ones((3, 3), np.uint8)
     behind = np.float32(SLANT * pixel) * z + np.float32(_BEHIND) * noise * z * z

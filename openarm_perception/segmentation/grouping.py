@@ -86,7 +86,7 @@ def beyond_bend(notch: Array, apart: Array, pairs: Labels, count: int) -> Array:
         notch: (n,) as of `notches`.
         apart: (n,) how far apart the planes were fitted, m; a hollow surface turns in proportion to it.
         pairs: (n, 2) of patches.
-        count: Of patches.
+        count: Number of patches.
     """
     known = np.isfinite(notch)
     of = np.concatenate([pairs[known, 0], pairs[known, 1]])
@@ -149,7 +149,7 @@ def votes(
         pairs: (n, 2) of patches.
         length: (n,) of their borders, pixels.
         broken: (n,) of that, where depth breaks.
-        noise: Of a depth at 1 m, m.
+        noise: Noise of a depth at 1 m, m.
     """
     a, b = pairs.T
     apart = np.maximum(np.linalg.norm(patches.centre[a] - patches.centre[b], axis=1), 1e-6)
@@ -170,7 +170,7 @@ def partition(moments: Array, border: Labels, noise: float) -> tuple[NDArray[np.
     Args:
         moments: (count, 10) as of `patch_moments`.
         border: (k, 3) as of `borders`.
-        noise: Of a depth at 1 m, m.
+        noise: Noise of a depth at 1 m, m.
 
     Returns:
         (count,) group of each patch, the number of one of its patches; the planes that were found last.
@@ -198,7 +198,7 @@ def group(count: int, pairs: Labels, weight: Array, length: Array) -> NDArray[np
     """Join patches while the mean vote along their common border is for it, the surest first.
 
     Args:
-        count: Of patches, with row 0.
+        count: Number of patches, with row 0.
         pairs: (n, 2).
         weight: (n,) sums of votes.
         length: (n,) of votes.

@@ -112,7 +112,7 @@ def local_normals(points: Points, step: int, reach: int, noise: np.float32) -> P
         points: (h, w, 3).
         step: Rows and columns from one normal to the next.
         reach: The window is 2 · reach + 1 pixels wide.
-        noise: Of a depth at 1 m, m.
+        noise: Noise of a depth at 1 m, m.
 
     Returns:
         (ceil(h / step), ceil(w / step), 3) unit vectors towards the camera; NaN where there are too few points.
@@ -147,7 +147,7 @@ def breaks(points: Points, wanted: Mask, pixel: float, noise: np.float32) -> Byt
         points: (h, w, 3).
         wanted: (h, w); to what is not wanted, depth breaks.
         pixel: Tangent of the angle between neighbouring pixels.
-        noise: Of a depth at 1 m, m.
+        noise: Noise of a depth at 1 m, m.
     """
     h, w, _ = points.shape
     out = np.zeros((h, w), np.uint8)
@@ -195,7 +195,7 @@ def grow_patches(strength: Bytes, broken: Bytes, wanted: Mask, size: int) -> Lab
         strength: (h, w) how much the surface bends.
         broken: (h, w) as from `breaks`.
         wanted: (h, w).
-        size: Of a cell, pixels.
+        size: Size of a cell, pixels.
 
     Returns:
         (h, w) patch of every pixel that is wanted, from 1 on; 0 of the others.

@@ -62,7 +62,7 @@ def survey(label: NDArray[np.uint16], points: Points, robot: Mask, noise: float)
         label: (h, w) 0: none.
         points: (h, w, 3) organised, optical frame, m.
         robot: (h, w) pixels of the robot.
-        noise: Of a depth at 1 m, m.
+        noise: Noise of a depth at 1 m, m.
     """
     count = int(label.max())
     sums = _survey(label, points, robot, np.float32(noise), max(2, round(_GAP * label.shape[1])), count)

@@ -41,7 +41,7 @@ class Shape:
 
     Attributes:
         footprint: `rectangle` or `circle`: it is a prism; `bound`: it is none, this is the box around what was seen.
-        height: Of its highest place over the plane, m.
+        height: Height of its highest place over the plane, m.
         why: Why it is no prism; empty for one.
     """
 

@@ -49,7 +49,7 @@ class Support:
         noise: Standard deviation of a depth at 1 m, m; it grows with the square of the depth.
         hull: (k, 2) outline of what is seen of the plane, m, in the axes below.
         axes: (3, 2) directions in the plane, which with the normal are a right-handed frame.
-        share: Of the measured points that lie on it.
+        share: Share of the measured points that lie on it.
     """
 
     normal: Array
@@ -154,7 +154,7 @@ def support_at(points: Points, T_base_camera: Array, height: float) -> Support:
     Args:
         points: (h, w, 3) organised, optical frame, m; NaN where nothing was measured.
         T_base_camera: (4, 4) optical frame in the base frame, whose z points up.
-        height: Of the plane in the base frame, m.
+        height: Height of the plane in the base frame, m.
     """
     normal = T_base_camera[2, :3].astype(np.float64)
     offset = float(T_base_camera[2, 3]) - height

@@ -35,7 +35,7 @@ class PairMatcher(Generic[T]):
         """Add an image; return the stamp of the left one, and the left and right image, when it completes a pair.
 
         Args:
-            side: Of the camera.
+            side: Side of the camera.
             t_ns: Stamp.
             image: Message or array.
         """

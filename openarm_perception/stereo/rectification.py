@@ -34,7 +34,7 @@ class Rectified:
     """What makes a rectified image of one camera's.
 
     Attributes:
-        lens: Of the camera.
+        lens: Lens of the camera.
         R: Rotation to the rectified frame, (3, 3).
         P: Projection of the rectified camera, (3, 4), pixels; P[0, 3] of the right one is -fx × baseline.
     """
@@ -61,7 +61,7 @@ class Rectification:
         right: Of the right camera.
 
     Attributes:
-        intrinsics: Of both rectified cameras.
+        intrinsics: Intrinsics of both rectified cameras.
         baseline: Distance of the right camera to the right of the left one, m.
 
     Raises:

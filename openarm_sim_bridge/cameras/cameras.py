@@ -59,7 +59,7 @@ class SimulatedCameras:
         """Draw one camera's view of the loaded state.
 
         Args:
-            name: Of the camera.
+            name: Name of the camera.
             colour: (height, width, 3), filled.
             depth: (height, width), filled with mm (uint16) or m (float32); None without depth.
 

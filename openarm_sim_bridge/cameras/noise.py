@@ -42,7 +42,7 @@ def add_depth_noise(z: Floats, focal: float, config: DepthNoiseConfig, rng: np.r
     Args:
         z: (height, width) true depth, m, NaN where invalid.
         focal: Focal length, pixels.
-        config: Of the noise.
+        config: Parameters of the noise.
         rng: Source of the noise.
     """
     edge, low, high = _edges(z, config.jump)
@@ -77,7 +77,7 @@ def add_colour_noise(pixels: Bytes, config: ColourNoiseConfig, rng: np.random.Ge
 
     Args:
         pixels: (height, width, 3), changed.
-        config: Of noise and exposure.
+        config: Parameters of noise and exposure.
         rng: Source of the noise.
     """
     if config.sigma == 0.0 and config.exposure == 1.0:

@@ -40,8 +40,8 @@ def create_gl_context(width: int, height: int) -> Any:
     The backend is that of MUJOCO_GL (egl or osmesa); when it is not set, EGL is tried first and OSMesa second.
 
     Args:
-        width: Of the largest image, pixels.
-        height: Of the largest image, pixels.
+        width: Width of the largest image, pixels.
+        height: Height of the largest image, pixels.
 
     Raises:
         OpenArmError: ENVIRONMENT, with what failed and what to install.
@@ -116,7 +116,7 @@ class SnapshotRenderer:
         """Draw one camera's view of the loaded state: colour and depth from one pass.
 
         Args:
-            name: Of the camera.
+            name: Name of the camera.
             colour: (height, width, 3), filled.
             depth: (height, width), filled with mm (uint16) or m (float32); None when it is not wanted.
             noise: Makes the depth (m, NaN where invalid, before rounding) as noisy as a real camera's.

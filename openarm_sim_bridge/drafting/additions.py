@@ -32,10 +32,10 @@ def add_stand(
     The root link is then `world`, the name of MuJoCo's; what was on that is on the stand.
 
     Args:
-        root: Of the URDF.
+        root: Root element of the URDF.
         robot: The same, read.
         base: Link to add, on the floor.
-        place: Of the robot, in the frame of the base.
+        place: Place of the robot, in the frame of the base.
         turn: Of it about z, rad.
     """
     T = se3.make(se3.rot_z(turn), place)

@@ -36,7 +36,7 @@ class AdoptedUrdf:
 
     Args:
         source: URDF, or xacro.
-        folder: Of the draft.
+        folder: Folder of the draft.
         edits: Limits of joints; where the robot stands is added by the draft.
         arguments: Of xacro, by name.
         packages: Folders of packages by name.

@@ -163,7 +163,7 @@ def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> tuple[
 
     Args:
         robot: The robot.
-        name: Of the arm.
+        name: Name of the arm.
         base: Link that it stands on.
         tip: Link of its tool centre point.
 

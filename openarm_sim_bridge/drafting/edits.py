@@ -19,7 +19,7 @@ class BoxEdit(Config):
     """A box on a link.
 
     Attributes:
-        name: Of the element.
+        name: Name of the element.
         size: Full edges.
         xyz: Of its middle, in the frame of the link.
         material: Of a visual.
@@ -61,7 +61,7 @@ class AttachEdit(Config):
     Attributes:
         file: Path, from the folder of the robot's MJCF.
         body: That carries it.
-        prefix: Of its names.
+        prefix: Prefix of its names.
         xyz: Of its origin, in the frame of the body.
         rpy: Of its axes.
     """
@@ -94,7 +94,7 @@ class Edits(Config):
 
     Attributes:
         base: Link that has what the MJCF fixes to the world.
-        prefix: Of all bodies, joints, geoms and sites, for names that no other robot has.
+        prefix: Prefix of all bodies, joints, geoms and sites, for names that no other robot has.
         stand: Where the MJCF stands in the base frame, whose origin is on the floor.
         turn: How it is turned there about z, rad.
         attach: Further MJCFs.

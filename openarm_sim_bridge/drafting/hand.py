@@ -43,7 +43,7 @@ class MeasuredHand:
 
     Attributes:
         parts: As `HandParts` has it.
-        sign: Of the finger joint, as `ArmParts.finger_sign`.
+        sign: Sign of the finger joint, as `ArmParts.finger_sign`.
         pads: Boxes to add by link: pose (4, 4) in the link, and edges (3,); none where it has a pad.
         T_tip_tcp: Where the tool centre point should be, in the link that was given for it, (4, 4); None: it is there.
     """
@@ -59,7 +59,7 @@ class _Face:
     """The flat of a finger that faces the other one, in the tool frame.
 
     Attributes:
-        side: Of the middle on which it is, -1 or 1.
+        side: Side of the middle on which it is, -1 or 1.
         low: Least x and z.
         high: Greatest x and z.
         y: Of it.

@@ -94,7 +94,7 @@ class MeshFiles:
         """Write the files.
 
         Args:
-            folder: Of the robot.
+            folder: Folder of the robot.
             limit: Of triangles that are seen, each as often as it is.
             detail: Weight by the stem of a visual mesh, see `Edits`.
 

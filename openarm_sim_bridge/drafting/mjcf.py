@@ -78,7 +78,7 @@ class UrdfDraft:
     """The URDF of a compiled model.
 
     Args:
-        name: Of the robot.
+        name: Name of the robot.
         model: Its bodies have at most one joint each, a hinge or slide.
         edits: What is not in the MJCF.
         shared: As for `MeshFiles`.

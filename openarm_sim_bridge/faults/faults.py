@@ -183,7 +183,7 @@ def checked_fault(name: str, data: Mapping[str, Any], seed: int = 0) -> Fault:
     Args:
         name: One of `FAULTS`.
         data: Its parameters; those left out are the defaults.
-        seed: Of all randomness of the fault.
+        seed: Seed of all randomness of the fault.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the faults there are, or the parameter that is wrong.
@@ -206,7 +206,7 @@ def parse_fault(name: str, text: str, seed: int = 0) -> Fault:
     Args:
         name: One of `FAULTS`.
         text: YAML.
-        seed: Of all randomness of the fault.
+        seed: Seed of all randomness of the fault.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, as `checked_fault`, or when the text is no YAML mapping.

@@ -161,7 +161,7 @@ def nudge(world: World, parameters: ObjectNudged, seed: int) -> None:
     Args:
         world: The world.
         parameters: Which object, and how far.
-        seed: Of the direction.
+        seed: Seed of the direction.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the objects there are; SCENE_INVALID, when it would overlap something.

@@ -119,7 +119,7 @@ def serve(end: socket.socket) -> None:
     """Run the node until the bridge ends.
 
     Args:
-        end: Of the socket to the bridge.
+        end: End of the socket to the bridge.
     """
     # Signals of the terminal are for the bridge; this process ends when the bridge lets go of the socket.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -119,7 +119,7 @@ class CameraPublisher:
         """Publish the topics of a camera that have subscribers.
 
         Args:
-            name: Of the camera.
+            name: Name of the camera.
             t_ns: Stamp.
             drawn: False when there is a CameraInfo only.
         """

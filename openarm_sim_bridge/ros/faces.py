@@ -28,7 +28,7 @@ class Face(ABC):
     """Controllers of a world, and how they are met.
 
     Attributes:
-        controller: Of all joints.
+        controller: Controller of all joints.
         wall_stamps: Stamps are of the wall clock, and there is no /clock.
     """
 
@@ -60,7 +60,7 @@ class SuiteFace(Face):
     Args:
         node: Owner.
         config: Parameters.
-        stage: Of the world.
+        stage: Stage of the world.
         world: The world.
     """
 
@@ -96,7 +96,7 @@ class OpenArmRos2Face(Face):
 
     Args:
         node: Owner.
-        stage: Of the world.
+        stage: Stage of the world.
         world: The world.
 
     Raises:
@@ -140,7 +140,7 @@ class MotorFace(Face):
     Args:
         node: Owner.
         config: Parameters.
-        stage: Of the world.
+        stage: Stage of the world.
         world: The world.
 
     Raises:

@@ -30,7 +30,7 @@ class PositionControllerServer:
 
     Args:
         node: Owner.
-        name: Of the controller.
+        name: Name of the controller.
         controller: The controller.
         simulation: Whose thread runs it.
     """

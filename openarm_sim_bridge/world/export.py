@@ -41,7 +41,7 @@ def export(kind: Kind, scene: str | None = None, seed: int = 0, folder: Path | N
         kind: "urdf": expanded, one file; "srdf"; "mjcf": as MuJoCo reads it, with actuators and contact settings
             (MuJoCo writes six digits).
         scene: For MJCF: name or path of a scene to put around the robot, with the cameras; None is the robot alone.
-        seed: Of the scene "random".
+        seed: Seed of the scene "random".
         folder: In which the text will be: mesh files are named from there; None: by absolute paths.
 
     Raises:
@@ -100,7 +100,7 @@ def render(
         width: Pixels.
         height: Pixels.
         view: One of `VIEWS`, or the name of a camera.
-        seed: Of the scene "random".
+        seed: Seed of the scene "random".
         finger: Distance of the pads from the middle of the hands, m.
 
     Returns:

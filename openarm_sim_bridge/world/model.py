@@ -96,7 +96,7 @@ def build_spec(
         description: The robot, from `RobotDescription.load()`.
         scene: Table and objects.
         cameras: By name; mounts with an error are placed by `mount_seed`.
-        mount_seed: Of the mount errors; None is the nominal mounts.
+        mount_seed: Seed of the mount errors; None is the nominal mounts.
         physics: None is the defaults.
         robot: Of `robot_spec` with the same physics, which saves reading the URDF; not changed.
 

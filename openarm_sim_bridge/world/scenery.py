@@ -174,7 +174,7 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed
     Args:
         spec: Model that is extended.
         cameras: With nominal mounts.
-        mount_seed: Of the mount errors; None is the nominal mounts.
+        mount_seed: Seed of the mount errors; None is the nominal mounts.
 
     Raises:
         OpenArmError: CONFIG_INVALID, when a parent is not a link of the robot.

@@ -26,7 +26,7 @@ class Stage:
     Args:
         description: The robot as the suite believes; what is simulated is as its folder describes it.
         cameras: By name.
-        mount_seed: Of the camera mounts' errors; None is the nominal mounts.
+        mount_seed: Seed of the camera mounts' errors; None is the nominal mounts.
         physics: Solver, contacts, fingers.
         hardware: Motors of the arms, and how they differ from the description; None is ideal ones.
     """

@@ -19,7 +19,7 @@ class Reader:
     """One way in for files.
 
     Args:
-        name: Of the file that is written; its suffix matters to some readers.
+        name: Name of the file that is written; its suffix matters to some readers.
         sound: What is altered.
         alter: How.
         read: Takes the path of the altered file.

@@ -49,7 +49,7 @@ def samples_of(
         camera: Camera whose images are used; empty: the only one.
         board: Board to detect.
         carrier: Link that holds the board when the camera is fixed; empty is the node's parameter.
-        mount_seed: Of simulated mounts; None is what the bag says of itself.
+        mount_seed: Seed of simulated mounts; None is what the bag says of itself.
 
     Returns:
         The samples, and what became of all images.

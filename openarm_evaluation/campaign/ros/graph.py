@@ -47,7 +47,7 @@ def rows_of_graph(options: CampaignOptions, seeds: Sequence[int], folder: Path, 
     Args:
         options: What is run.
         seeds: One task each.
-        folder: Of the campaign; it gets logs, parameters and scenes.
+        folder: Folder of the campaign; it gets logs, parameters and scenes.
         keep: Takes a row.
 
     Raises:

@@ -32,7 +32,7 @@ def make_task(set_name: str, seed: int, objects: str = "") -> Task:
 
     Args:
         set_name: Of the suite.
-        seed: Of the task.
+        seed: Seed of the task.
         objects: Which objects suites of any shape take, as `things.object_sources`.
 
     Raises:

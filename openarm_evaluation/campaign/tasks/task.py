@@ -44,7 +44,7 @@ class Task:
 
     Attributes:
         set_name: Of `SUITES`.
-        seed: Of everything that is drawn.
+        seed: Seed of everything that is drawn.
         scene: What is on the table.
         labels: Requested objects, one after the other.
         arm: auto, or an arm of the robot.
@@ -52,9 +52,9 @@ class Task:
         fault: What goes wrong; None: nothing.
         sets: Parameters of nodes, `node.param=value`: faults that nodes inject themselves.
         codes: Allowed results; OK is placed. Without OK it is impossible and must be refused.
-        mount_seed: Of the true camera mounts; None: nominal.
-        dynamics_seed: Of motors, masses and joint zeros; None: that of the configuration.
-        hand_seed: Of stops and friction of the fingers; None: that of the configuration.
+        mount_seed: Seed of the true camera mounts; None: nominal.
+        dynamics_seed: Seed of motors, masses and joint zeros; None: that of the configuration.
+        hand_seed: Seed of stops and friction of the fingers; None: that of the configuration.
         place: (x, y) of the requested footprint centre, base frame, m; None: chosen by the suite.
         posture: Joints that start elsewhere than at home, rad by name.
         clear: Repeated labels are several objects: what was placed stays where it is.

@@ -63,7 +63,7 @@ def objects_task(seed: int, objects: str = "") -> Task:
     """Make a task with one object, the seed modulo their number, on one of its sides, for either arm.
 
     Args:
-        seed: Of side, place, turn and appearance.
+        seed: Seed of side, place, turn and appearance.
         objects: As `object_sources`.
     """
     sources, rng = object_sources(objects), np.random.default_rng([seed, 41])

@@ -48,7 +48,7 @@ class Hit:
     """When a fault really happened.
 
     Attributes:
-        state: Of the grasp at that time; None: not yet.
+        state: State of the grasp at that time; None: not yet.
         began: s, monotonic.
         ended: The same of its end.
         back: s from its end until the graph was ready.
@@ -75,13 +75,13 @@ class Report:
     """What was done and seen.
 
     Attributes:
-        seed: Of the schedule.
+        seed: Seed of the schedule.
         seconds: s of wall clock.
         rounds: One row each: request, answer, fault, times.
         violations: Each with its round, fault and time.
         usage: Memory, descriptors and threads of the nodes.
         cut: Why it ended early; "" when it did not.
-        code: Of that.
+        code: Code of that.
     """
 
     seed: int
@@ -109,7 +109,7 @@ def run(
     """Run picks and faults on a graph of its own until the time is over, or something ends it; return what was seen.
 
     Args:
-        seed: Of scenes, requests and faults.
+        seed: Seed of scenes, requests and faults.
         seconds: s of wall clock; a round that has begun is finished.
         kinds: Of faults.
         folder: Gets logs, scenes and memory; `run` below it is the run folder.

@@ -54,7 +54,7 @@ class Fit:
 
     Args:
         data: Folder of the data set.
-        folder: Of the run; one that holds a run of the same settings goes on.
+        folder: Folder of the run; one that holds a run of the same settings goes on.
         config: How to train.
         first: Weights to begin with, such as the suite's; their classes must be those of the data.
 

@@ -64,7 +64,7 @@ def write_page(
     """Write the page, and its figures as JSON next to it.
 
     Args:
-        path: Of the HTML file.
+        path: Path of the HTML file.
         samples: The set.
         results: By name of the model; failures are shown of the last one.
         curve: Rows of a training run; empty without one.

@@ -41,8 +41,8 @@ class Samples:
     """A set of a data set; pictures stay compressed in memory.
 
     Args:
-        folder: Of the data set.
-        name: Of the set.
+        folder: Folder of the data set.
+        name: Name of the set.
 
     Raises:
         OpenArmError: CONFIG_INVALID, when the set is missing or empty; INVALID_ARGUMENT, for a wrong label.

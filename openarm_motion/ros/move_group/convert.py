@@ -63,7 +63,7 @@ class Converter:
 
     Args:
         description: The robot.
-        names: Of its groups and links.
+        names: Names of its groups and links.
         in_base: Looks frames up.
     """
 

@@ -87,7 +87,7 @@ def check_fields(message: Any, honoured: Sequence[str], what: str) -> None:
     """Refuse what a message asks and no field of a list honours.
 
     Args:
-        message: Of any type.
+        message: Message of any type.
         honoured: Paths.
         what: Names the message.
 

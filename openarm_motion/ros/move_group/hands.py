@@ -35,7 +35,7 @@ class Hands:
         config: Names and type of their actions, and how fast fingers are.
         service: Knows where they are.
         description: The robot.
-        names: Of its groups.
+        names: Names of its groups.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ class Requests:
 
     Args:
         service: Answers them.
-        names: Of groups and links.
+        names: Names of groups and links.
         convert: Messages to core data.
     """
 

@@ -50,10 +50,10 @@ class SceneServer:
         node: Owner.
         service: Has the scene.
         description: The robot.
-        names: Of its links.
+        names: Names of its links.
         convert: Messages to core data.
         requests: Checks what hands may touch.
-        octomap: Of the scene.
+        octomap: Octomap of the scene.
         on_change: Called when the scene has changed.
         refuse: Reports a refusal of what has a name.
     """
