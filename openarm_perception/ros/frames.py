@@ -252,15 +252,15 @@ class FrameBuilder:
     def _frame(self, color: AnyImage, depth: AnyImage) -> Frame:
         """Make a frame: without distortion, and with the depth where the colour camera sees it."""
         names, chosen, counts = self._topics, self._chosen, depth_image(depth)
-        seen = _View(names.info, self._rectified(names.color))
+        seen = _Images(names.info, self._rectified(names.color))
         lens = self._lens(seen)
         registered = _REGISTERED.search(names.depth) if chosen.registered == "auto" else chosen.registered == "yes"
         info, as_color = names.depth_info, True
         if not info or (registered and counts.shape == (lens.intrinsics.height, lens.intrinsics.width)):
             info = names.info
         else:  # depth on a rectified colour image has the CameraInfo of its lens, too
-            as_color = _alike(self._lens(_View(names.info, False)), self._lens(_View(info, False)))
-        measured = _View(info, self._rectified(names.depth) or (as_color and seen.rectified))
+            as_color = _alike(self._lens(_Images(names.info, False)), self._lens(_Images(info, False)))
+        measured = _Images(info, self._rectified(names.depth) or (as_color and seen.rectified))
         of_depth = self._lens(measured)
         T_color_depth = np.eye(4) if registered else self._between(color, depth)
         if measured != seen:
@@ -277,14 +277,14 @@ class FrameBuilder:
     def _rectified(self, image: str) -> bool:
         return is_rectified(image) if self._chosen.rectified == "auto" else self._chosen.rectified == "yes"
 
-    def _lens(self, view: _View) -> Lens:
+    def _lens(self, view: _Images) -> Lens:
         """Return a lens: the given one of colour, or by a CameraInfo."""
         given = self._chosen.lens
         if given is not None and view.info == self._topics.info:
             return Lens(given.intrinsics) if view.rectified else given
         return lens_from_info(self._newest[view.info], rectified=view.rectified)
 
-    def _turned(self, view: _View) -> Array:
+    def _turned(self, view: _Images) -> Array:
         """Return the pose (4, 4) of the frame of these images in that of their message.
 
         That is the frame of rectified images, as `image_geometry` has it; R turns it where the lens of a stereo pair is
@@ -309,7 +309,7 @@ class FrameBuilder:
         return pose
 
 
-class _View(NamedTuple):
+class _Images(NamedTuple):
     """Topic of the CameraInfo of images, and whether they are rectified."""
 
     info: str

@@ -55,7 +55,7 @@ class MeasuredHand:
 
 
 @dataclass(frozen=True, eq=False)
-class _Face:
+class _FingerFlat:
     """The flat of a finger that faces the other one, in the tool frame.
 
     Attributes:
@@ -85,7 +85,7 @@ def measured(robot: RobotDescription, arm: Mapping[str, Any]) -> MeasuredHand | 
     Pads are boxes in front of the flat of each finger. What is measured is right to the millimetres by which the hulls
     of a draft are larger than the meshes.
     """
-    hand = _Hand(robot, arm)
+    hand = _HandGeometry(robot, arm)
     if len(arm["fingers"]) != 2 or not all(len(hand.surfaces[link]) for link in arm["fingers"]):
         return None
     closed, opened = sorted((hand.joint.lower, hand.joint.upper), key=hand.apart)
@@ -120,14 +120,14 @@ def measured(robot: RobotDescription, arm: Mapping[str, Any]) -> MeasuredHand | 
 def reach_of_hand(robot: RobotDescription, arm: str) -> tuple[float, float]:
     """Return how far the shapes of an arm's hand reach along x of its tool frame, and how far back they begin, m."""
     parts = robot.arm(arm)
-    hand = _Hand(robot, parts.model_dump())
+    hand = _HandGeometry(robot, parts.model_dump())
     points = hand.points(list(hand.surfaces), robot.hand(arm).opened, np.eye(4))
     back = min(-float(points[:, 2].min()), _BACK)
     return float(points[points[:, 2] > -back - 0.03][:, 0].max()), back
 
 
 def _parts(rows: Array, positions: Array, kind: str) -> dict[str, Any] | None:
-    """`HandParts` of what `_Hand.row` returns from closed to open; None where that does not open."""
+    """`HandParts` of what `_HandGeometry.row` returns from closed to open; None where that does not open."""
     rising = [0]
     for k in range(1, len(rows)):
         if rows[k, 0] > rows[rising[-1], 0] + 1e-4:
@@ -156,14 +156,14 @@ def _parts(rows: Array, positions: Array, kind: str) -> dict[str, Any] | None:
     return parts | {key: round(float(np.clip(parts[key], 0.0, 0.2)), 4) for key in lengths}
 
 
-def _pad(face: _Face, proud: float) -> tuple[Array, Array]:
+def _pad(face: _FingerFlat, proud: float) -> tuple[Array, Array]:
     """Pose (4, 4) and edges (3,) of a pad in the tool frame, so far in front of the flat."""
     x, z = np.clip(face.high - face.low, *_EDGES)
     aside = face.side * (0.5 * _THICK - proud)
     return se3.make(p=face.middle + np.array([0.0, aside, 0.0])), np.array([x, _THICK, z])
 
 
-class _Hand:
+class _HandGeometry:
     """The collision shapes beyond the last joint of an arm."""
 
     def __init__(self, robot: RobotDescription, arm: Mapping[str, Any]) -> None:
@@ -206,7 +206,7 @@ class _Hand:
             opening = -opening  # either end will do: the given one, where it is an axis
         return se3.make(se3.rotation_from_z_y(out, opening).round(12) + 0.0)
 
-    def faces(self, q: float, T_tip_tcp: Array) -> tuple[_Face, _Face]:
+    def faces(self, q: float, T_tip_tcp: Array) -> tuple[_FingerFlat, _FingerFlat]:
         """The flats of both fingers."""
         one, other = (self._face(link, q, T_tip_tcp) for link in self._arm["fingers"])
         return one, other
@@ -231,7 +231,7 @@ class _Hand:
         between = points[(np.abs(points[:, 1]) < max(finger, _NARROW)) & (np.abs(points[:, 0]) < _HELD)]
         return finger, float(np.mean(ends)), max(tips), float(between[:, 2].max(initial=-0.2)), max(widths)
 
-    def _face(self, link: str, q: float, T_tip_tcp: Array) -> _Face:
+    def _face(self, link: str, q: float, T_tip_tcp: Array) -> _FingerFlat:
         points = self.points([link], q, T_tip_tcp)
         tip, side = float(points[:, 2].max()), math.copysign(1.0, float(points[:, 1].mean()))
         if self.has_pad(link):
@@ -240,7 +240,7 @@ class _Hand:
         near = points[points[:, 2] > tip - _TIPS]
         y = float((side * near[:, 1]).min())
         flat = near[side * near[:, 1] < y + _FLAT][:, [0, 2]]
-        return _Face(side, flat.min(axis=0), flat.max(axis=0), side * y, tip)
+        return _FingerFlat(side, flat.min(axis=0), flat.max(axis=0), side * y, tip)
 
     def _middles(self, q: float, T_tip_tcp: Array) -> list[Array]:
         found = [self.points([link], q, T_tip_tcp) for link in self._arm["fingers"]]
