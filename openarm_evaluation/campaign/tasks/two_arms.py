@@ -36,7 +36,7 @@ _BESIDE = 0.10
 #: Between the middles of a place and any object, m.
 _APART = 0.13
 #: Draws of a scene for a push; so many of them each so much farther off than those before, m.
-_PUSHES, _NEAR, _FARTHER = 200, 10, 0.02
+_PUSHES, _NEAR, _FARTHER = 200, 10, 0.01
 #: Least distance of its middle from the far edge of the table, m.
 _FAR_EDGE = 0.06
 _REGION = "work.region of robot.yaml"
