@@ -160,9 +160,8 @@ def _table(rows: list[tuple[str, ...]]) -> str:
     from rich.text import Text
 
     table = Table(box=None, pad_edge=False)
-    for name in ("#", "colour", "shape", "edges [mm]", "± [mm]", "x y z [m]", "pixels"):
-        table.add_column(name, no_wrap=True)
-    table.add_column("why it is no prism", no_wrap=True)
+    for name in ("#", "colour", "shape", "edges [mm]", "± [mm]", "x y z [m]", "pixels", "why it is no prism"):
+        table.add_column(Text(name), no_wrap=True)  # as a string, [mm] would be markup
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     lines = as_text(table, _WIDE).splitlines() if rows else []

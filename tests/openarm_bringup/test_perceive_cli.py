@@ -61,6 +61,7 @@ def test_a_box_is_found_measured_and_drawn(files, tmp_path, capsys):
 def test_a_table_is_printed(files, capsys):
     assert cli.run(["perceive", *files, "--depth-scale", "0.0001"]) == 0
     shown = capsys.readouterr().out
+    assert "edges [mm]" in shown
     assert "red     box" in shown
     assert "1 on a plane" in shown
 
