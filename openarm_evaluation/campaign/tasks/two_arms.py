@@ -35,8 +35,8 @@ _ASIDE = 0.20
 _BESIDE = 0.10
 #: Between the middles of a place and any object, m.
 _APART = 0.13
-#: Draws of a scene for a push; so many of them each so much farther off than those before, m.
-_PUSHES, _NEAR, _FARTHER = 200, 10, 0.01
+#: Draws of a scene for a push: those next to the region; then so many each so much farther off, m; all.
+_NEAR, _FEW, _FARTHER, _PUSHES = 400, 10, 0.02, 500
 #: Least distance of its middle from the far edge of the table, m.
 _FAR_EDGE = 0.06
 _REGION = "work.region of robot.yaml"
@@ -94,7 +94,7 @@ def push_task(seed: int) -> Task:
     rng, arms, number = np.random.default_rng([seed, 5]), RobotDescription.load().arm_names, itertools.count()
 
     def draw() -> Task | None:
-        scene = _one_object(seed, rng, _FARTHER * (next(number) // _NEAR))
+        scene = _one_object(seed, rng, _FARTHER * max(0, (next(number) - _NEAR) // _FEW + 1))
         if any(_graspable(scene, arm) for arm in arms):
             return None
         return Task("push", seed, scene, (scene.objects[0].label,), kind="push", route="push")
