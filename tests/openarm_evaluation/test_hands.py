@@ -27,6 +27,7 @@ def task(width: float) -> Task:
     return Task("nominal", 0, Scene(name="bench", objects=(box,)), ("red",))
 
 
+@pytest.mark.long
 def test_a_hand_with_stops_of_its_own_is_refused_until_it_is_learned_and_then_works_with_the_width_it_has(
     tmp_path: Path,
 ) -> None:
