@@ -35,7 +35,7 @@ _ASIDE = 0.20
 _BESIDE = 0.10
 #: Between the middles of a place and any object, m.
 _APART = 0.13
-#: Draws of a scene for a push: those next to the region; then so many each so much farther off, m; all.
+#: Draws of a scene for a push: those next to the region; then so many in each strip so much farther off, m; all.
 _NEAR, _FEW, _FARTHER, _PUSHES = 400, 10, 0.02, 500
 #: Least distance of its middle from the far edge of the table, m.
 _FAR_EDGE = 0.06
@@ -105,9 +105,9 @@ def push_task(seed: int) -> Task:
 
 
 def _one_object(seed: int, rng: np.random.Generator, farther: float) -> Scene:
-    """Draw an object for `push_task`: past the region and so much farther, between the arms."""
+    """Draw an object for `push_task` between the arms: past the region, or in the strip that is so much farther off."""
     region, far = robot_work().region, within(robot_work().table.x, 0.0, _FAR_EDGE)[1]
-    low, high = past(region.x, 0.01 + farther, 0.07 + farther)
+    low, high = past(region.x, 0.05 + farther if farther else 0.01, 0.07 + farther)
     xs, half = (min(low, far), min(high, far)), region.abs_y[0] / 2.0
     color = str(rng.choice(list(PALETTE)))
     a, b, c = (round(float(edge), 3) for edge in rng.uniform((0.04, 0.04, 0.04), (0.07, 0.07, 0.06)))
