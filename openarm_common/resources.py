@@ -41,6 +41,11 @@ def config_dir() -> Path:
     return resource_root() / "config"
 
 
+def cache_dir() -> Path:
+    """Return the folder of what is computed once: `openarm` in $XDG_CACHE_HOME, or in ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "openarm"
+
+
 def is_file(path: Path) -> bool:
     """Whether a path is that of a file; what can't be a path (too long, with a NUL) is none."""
     return os.path.isfile(path)

@@ -9,22 +9,16 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 from pathlib import Path
 
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError, said
-from openarm_common.resources import write_whole
+from openarm_common.resources import cache_dir, write_whole
 from openarm_common.types import Array, Ints
 
 #: Concavity that a part may have, share of the mesh's size; most parts; seed of the search, and its rounds a cut.
 _CONCAVITY, _PARTS, _SEED, _ROUNDS = 0.04, 32, 0, 60
-
-
-def cache_dir() -> Path:
-    """Return the folder of what is computed once: `openarm` in $XDG_CACHE_HOME, or in ~/.cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "openarm"
 
 
 def decomposed(vertices: Array, triangles: Ints, where: str) -> list[Array]:

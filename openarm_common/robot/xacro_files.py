@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from xml.parsers.expat import ExpatError
 
@@ -13,6 +17,7 @@ from xacro import substitution_args
 
 from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.resources import cache_dir, write_whole
 from openarm_common.robot.meshes import package_advice, package_folders
 
 #: What xacro raises for faulty files: little of it is wrapped.
@@ -20,6 +25,9 @@ _XACRO_RAISES = (
     xacro.XacroException, ExpatError, OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError,
     SyntaxError,
 )  # fmt: skip
+
+#: What makes an expansion depend on more than the files that it read: packages, variables, files that may come.
+_OF_ELSEWHERE = re.compile(rb"\$\((?!arg )|optional=|filename=[\"'][^\"']*[*?\[]")
 
 
 class _Arguments(dict[str, str]):
@@ -54,12 +62,36 @@ def description_text(
     """
     given = _Arguments(arguments or {})
     wanted = set(given)
-    text = _expanded(source, given, packages or {}) if source.suffix == ".xacro" else read_text(source)
+    if source.suffix != ".xacro":
+        text = read_text(source)
+    else:
+        text = _expanded(source, given, packages or {}) if given or packages else _kept(source)
     if unknown := wanted - given.asked:
         there = ", ".join(sorted(given.asked)) or "none"
         text = f"{source} has no argument {', '.join(sorted(unknown))}; it has: {there}"
         raise OpenArmError(Code.INVALID_ARGUMENT, text)
     return text
+
+
+def _kept(source: Path) -> str:
+    """Return an expansion without arguments; what depends on files alone is kept in the cache of the user."""
+    path = cache_dir() / "xacro" / hashlib.sha256(os.fsencode(source.resolve())).hexdigest()[:32]
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        kept = json.loads(path.read_bytes())
+        if kept["files"] == _digests(kept["files"]):
+            return str(kept["text"])
+    xacro.all_includes.clear()
+    text = _expanded(source, _Arguments({}), {})
+    with suppress(OSError, OpenArmError):  # a cache that can't be written costs time
+        read = [str(source), *xacro.all_includes]
+        if not any(_OF_ELSEWHERE.search(Path(file).read_bytes()) for file in read):
+            kept = {"files": _digests([xacro.__file__, *read]), "text": text}
+            write_whole(path, json.dumps(kept).encode())
+    return text
+
+
+def _digests(files: Iterable[str]) -> dict[str, str]:
+    return {os.path.abspath(file): hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files}
 
 
 def _expanded(source: Path, arguments: _Arguments, packages: Mapping[str, Path]) -> str:
