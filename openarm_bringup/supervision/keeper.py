@@ -36,8 +36,8 @@ class Probe(Protocol):
         """Return the conditions that do not hold yet."""
         ...
 
-    def parameters(self, node: str) -> frozenset[str]:
-        """Return the names of a node's parameters."""
+    def parameters(self, node: str) -> frozenset[str] | None:
+        """Return the names of a node's parameters; None as long as it has not answered."""
         ...
 
     def silence(self, node: str) -> float:
@@ -170,7 +170,8 @@ class Keeper:
                 {ended, getting_ready}, timeout=self.spec.ready_timeout, return_when=asyncio.FIRST_COMPLETED
             )
             if not ended.done() and not getting_ready.done():
-                missing = ", ".join(await supervisor.ask(lambda probe: probe.unmet(conditions, old)))
+                unmet = await supervisor.ask(lambda probe: probe.unmet(conditions, old))
+                missing = ", ".join(unmet) or "the list of its parameters"
                 await process.stop(supervisor.ladder)
                 return 1, f"was not ready after {self.spec.ready_timeout:g} s; missing: {missing}", 0.0
             ready_at = time.monotonic()
@@ -229,7 +230,8 @@ class Keeper:
 
     async def _check_parameters(self) -> None:
         """Refuse parameters that the node does not have; ROS would ignore them silently."""
-        existing = await self._supervisor.ask(lambda probe: probe.parameters(self.name))
+        while (existing := await self._supervisor.ask(lambda probe: probe.parameters(self.name))) is None:
+            await asyncio.sleep(self._supervisor.poll)
         for param in self.spec.params:
             if param not in existing:
                 own = [name for name in existing if not name.startswith("qos_overrides")]

@@ -10,16 +10,17 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.srv import ListParameters
+from rclpy.client import Client
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from openarm_bringup.messages import interface
 from openarm_bringup.supervision.graph import Ready
-from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import Watch
 from openarm_common.ros.client import ContextNode
 from openarm_common.ros.node import reliable
@@ -27,6 +28,24 @@ from openarm_common.ros.polled import Polled, Source
 
 #: Time that a service gets to answer before it is asked again, s.
 _ASK_AGAIN_S = 2.0
+
+
+class _Listing:
+    """A question for the parameters of a node, of which nothing waits for the answer."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+        self._answer: Any = None
+        self._asked = 0.0
+
+    def names(self) -> frozenset[str] | None:
+        """Return the names when they have come; until then, see that the question is put."""
+        if self._answer is not None and self._answer.done():
+            return frozenset(self._answer.result().result.names)
+        # A response is lost when the server has not matched the client's reader yet; then it is asked again.
+        if self.client.service_is_ready() and time.monotonic() - self._asked > _ASK_AGAIN_S:
+            self._answer, self._asked = self.client.call_async(ListParameters.Request()), time.monotonic()
+        return None
 
 
 class ReadinessClient(ContextNode):
@@ -42,6 +61,7 @@ class ReadinessClient(ContextNode):
         self._waiting: dict[str, Subscription] = {}
         self._received: set[str] = set()
         self._watches: dict[str, Watch] = {}
+        self._listing: dict[str, _Listing] = {}
         self._diagnostics = Polled(self._node, Source(DiagnosticArray, "/diagnostics", reliable(100)))
         self._troubles: dict[str, str] = {}
         self._stop = self._node.create_client(Trigger, "/stop")
@@ -72,24 +92,16 @@ class ReadinessClient(ContextNode):
                 self._troubles[status.name.partition(":")[0]] = status.message if bad else ""
         return self._troubles.get(node, "")
 
-    def parameters(self, node: str, timeout_s: float = 20.0) -> frozenset[str]:
-        """Return the names of a node's parameters.
-
-        Raises:
-            OpenArmError: TIMEOUT, when the node does not answer.
-        """
-        client = self._node.create_client(ListParameters, f"/{node}/list_parameters")
-        deadline = time.monotonic() + timeout_s
-        try:
-            self.spin_until(client.service_is_ready, timeout_s)
-            while (left := deadline - time.monotonic()) > 0.0:
-                # A response is lost when the server has not matched the client's reader yet; then it is asked again.
-                answer = client.call_async(ListParameters.Request())
-                if self.spin_until(answer.done, min(left, _ASK_AGAIN_S)):
-                    return frozenset(answer.result().result.names)
-            raise OpenArmError(Code.TIMEOUT, f"{client.srv_name}: no answer within {timeout_s:g} s")
-        finally:
-            self._node.destroy_client(client)
+    def parameters(self, node: str) -> frozenset[str] | None:
+        """Return the names of a node's parameters; None as long as it has not answered: call it again then."""
+        if node not in self._listing:
+            self._listing[node] = _Listing(self._node.create_client(ListParameters, f"/{node}/list_parameters"))
+        self._spin()
+        listing = self._listing[node]
+        if (names := listing.names()) is not None:
+            self._node.destroy_client(listing.client)
+            del self._listing[node]
+        return names
 
     def emergency_stop(self, seconds: float) -> str:
         """Let the joints hold; return the answer of who commands them, or why there is none within so long."""
