@@ -77,7 +77,7 @@ def test_probe_lists_parameters_of_who_answers(ros, probe: ReadinessClient) -> N
     names: list[frozenset[str]] = []
     ros.spin_until(lambda: names.extend(filter(None, [probe.parameters("arm")])) or bool(names))
     assert "speed.max" in names[0]
-    assert probe.parameters("nobody") is None
+    assert probe.parameters("absent") is None
 
 
 class World:
