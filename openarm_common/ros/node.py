@@ -385,7 +385,11 @@ _SYMBOLS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 def prepare() -> None:
     """Load what all nodes need: of a process that forks nodes, before it does."""
+    from numba.core.registry import cpu_target
+
     RobotDescription.load()
+    cpu_target.typing_context.refresh()  # what the first kernel of a process would load
+    cpu_target.target_context.refresh()
     messages = [module for name, module in list(sys.modules.items()) if name.endswith((".msg", ".srv", ".action"))]
     kinds: list[Any] = [type(one) for module in messages for one in vars(module).values() if isinstance(one, type)]
     for kind in kinds:
