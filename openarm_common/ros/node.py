@@ -388,8 +388,9 @@ def prepare() -> None:
     from numba.core.registry import cpu_target
 
     RobotDescription.load()
-    cpu_target.typing_context.refresh()  # what the first kernel of a process would load
-    cpu_target.target_context.refresh()
+    contexts: tuple[Any, Any] = cpu_target.typing_context, cpu_target.target_context
+    for context in contexts:
+        context.refresh()  # what the first kernel of a process would load
     messages = [module for name, module in list(sys.modules.items()) if name.endswith((".msg", ".srv", ".action"))]
     kinds: list[Any] = [type(one) for module in messages for one in vars(module).values() if isinstance(one, type)]
     for kind in kinds:
