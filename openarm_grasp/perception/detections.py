@@ -11,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from openarm_common import se3
 from openarm_common.detection import Detection, distances_from
@@ -23,6 +23,9 @@ from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_common.wanted import describe, select
 from openarm_grasp.config import DetectConfig
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 #: An object that is chosen by its position is no farther from it than this, m.
 SAME_PLACE = 0.05
@@ -244,13 +247,19 @@ def find(
     return _sighting(frames, track, clouds, limits)
 
 
+def _tree(points: NDArray[np.floating]) -> KDTree:
+    from scipy.spatial import KDTree  # a client of the grasp node needs the types of this module alone
+
+    return KDTree(points)
+
+
 def _sighting(
     frames: Sequence[Frame], track: Sequence[Detection], clouds: Sequence[LabelledCloud], limits: DetectConfig
 ) -> Sighting:
     """The mean of sights of one object, and what else is in view."""
     target = average(track)
     mine = [cloud.points[cloud.labels == 1] for cloud in clouds[-_CLOUDS:]]
-    shape = KDTree(np.concatenate(mine)) if mine else None
+    shape = _tree(np.concatenate(mine)) if mine else None
     others = _others(frames, target, limits.match_radius, shape)
     return Sighting(target, others, frames[-1].t_ns, tuple(clouds[-_CLOUDS:]))
 
@@ -280,7 +289,7 @@ def _stays(frames: Sequence[Frame], cloud: LabelledCloud) -> bool:
     mine, there = cloud.points[cloud.labels == 1], 0
     for frame in frames:
         if frame.cloud is not None and (standing := frame.cloud.points[frame.cloud.labels > 0]).size:
-            away, _ = KDTree(standing).query(mine)
+            away, _ = _tree(standing).query(mine)
             there += float(np.mean(away <= _SAME_POINT)) >= _MOST
     return 3 * there >= 2 * len(frames)
 

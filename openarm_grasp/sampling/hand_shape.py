@@ -13,15 +13,18 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import ceil
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Primitive, RobotDescription
 from openarm_common.types import Array
+
+if TYPE_CHECKING:
+    from scipy.spatial import ConvexHull
 
 #: Distance of the points that stand for a surface: of fingers, and of everything else.
 _FINE, _COARSE = 0.005, 0.008
@@ -115,7 +118,7 @@ def _opened(
     every = _pieces(robot, arm, robot.hand(arm).position(opening))
     fingers = _fingers(robot, arm, every)
     rest = [corners for link, corners in every if link not in robot.arm(arm).fingers]
-    pieces = [ConvexHull(corners) for corners in (*fingers, *rest, *housings)]
+    pieces = [_hull(corners) for corners in (*fingers, *rest, *housings)]
     points = np.concatenate([_surface(hull, _FINE if n < len(fingers) else _COARSE) for n, hull in enumerate(pieces)])
     equations = [np.unique(hull.equations.round(9), axis=0) for hull in pieces]
     starts = np.cumsum([0, *(len(e) for e in equations)]).astype(np.int64)
@@ -185,6 +188,12 @@ def _housings(robot: RobotDescription, arm: str, cameras: Iterable[CameraConfig]
     return found
 
 
+def _hull(corners: Array) -> ConvexHull:
+    from scipy.spatial import ConvexHull  # a client of the grasp node needs no hull
+
+    return ConvexHull(corners)
+
+
 def _surface(hull: ConvexHull, step: float) -> Array:
     """Points (n, 3) on and just below the surface of a convex hull, at most `step` apart along each axis of it.
 
@@ -217,7 +226,7 @@ def _pad(fingers: list[Array], finger: float, where: str) -> Array:
     grid = np.stack(np.meshgrid(xs, zs, indexing="ij"), axis=-1).reshape(-1, 2)
     inner = np.full(len(grid), np.inf)
     for corners in side:
-        e = ConvexHull(corners).equations
+        e = _hull(corners).equations
         # along y: normal_y y <= -(normal_x x + normal_z z + offset)
         right = -(grid @ e[:, [0, 2]].T + e[:, 3])
         with np.errstate(divide="ignore", invalid="ignore"):
