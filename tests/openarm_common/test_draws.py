@@ -60,23 +60,24 @@ def test_a_random_scene_has_as_many_objects_as_the_region_has_room_for(narrow):
 
 def test_a_suite_whose_scenes_do_not_fit_a_robot_says_so(monkeypatch):
     monkeypatch.setenv(ROBOT, "openarm_v2")
-    monkeypatch.setattr(two_arms, "_graspable", lambda scene, arm: True)
-    words = "push 7: a box of 40 to 70 mm between the arms, x from 0.35 m on, that neither can grasp: none of 500 draws"
+    monkeypatch.setattr(two_arms, "_to_push", lambda scene: False)
+    words = (
+        "push 7: a box of 40 to 70 mm between the arms, x from 0.35 m on, to be pushed before it is grasped: none of"
+    )
     error = refused(words, make_task, "push", 7)
     assert error.message.endswith("enlarge work.region of robot.yaml to all that the arms grasp, or its table")
     monkeypatch.setattr(two_arms, "random_scene", lambda seed, count: random_scene(3, count=1))
     refused("pairs 7: an object on either side: none of 1000 draws fits; enlarge work.region", make_task, "pairs", 7)
 
 
-def test_what_the_arms_grasp_next_to_their_region_is_drawn_farther_off(monkeypatch):
+def test_what_is_to_be_pushed_can_be_pushed_and_not_grasped(monkeypatch):
     monkeypatch.setenv(ROBOT, "openarm_v2")
-    seen: list[float] = []
+    scene = make_task("push", 5).scene
 
-    def graspable(scene, arm) -> bool:
-        seen.append(scene.objects[0].position[0])
-        return scene.objects[0].position[0] < 0.46
+    def to_push(x: float) -> bool:
+        item = scene.objects[0].model_copy(update={"position": (x, scene.objects[0].position[1])})
+        return two_arms._to_push(scene.model_copy(update={"objects": (item,)}))
 
-    monkeypatch.setattr(two_arms, "_graspable", graspable)
-    task = make_task("push", 1)
-    assert 0.46 <= task.scene.objects[0].position[0] < 0.52
-    assert max(seen[:400]) <= 0.42
+    assert to_push(scene.objects[0].position[0])
+    assert not to_push(0.30), "an arm grasps it there"
+    assert not to_push(0.70), "no arm comes there"

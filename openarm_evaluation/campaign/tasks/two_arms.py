@@ -6,7 +6,6 @@ Base frame, m; all is drawn from the seed. `Task.route` is the route by which th
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -18,13 +17,18 @@ from openarm_common.draws import first_fit
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import robot_work
+from openarm_common.robot.work import Table
 from openarm_common.scene.scene import PALETTE, Scene, SceneObject, parse_scene, random_scene
+from openarm_common.types import Array
 from openarm_evaluation.campaign.in_process_robot import approach_of
 from openarm_evaluation.campaign.robot import arms_behind
 from openarm_evaluation.campaign.tasks.task import Task, past, within
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.candidates import propose, shorter, target_box
+from openarm_grasp.context import GraspContext
+from openarm_grasp.perception.sightings import standing_at
+from openarm_grasp.planning.candidates import GraspCandidate, propose, shorter, target_box
 from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.pushes import closed_hand, destinations, push_ways
 from openarm_grasp.robot.interface import PlanGrasp
 from openarm_motion.planning.approach import plan_approach
 
@@ -35,10 +39,8 @@ _ASIDE = 0.20
 _BESIDE = 0.10
 #: Between the middles of a place and any object, m.
 _APART = 0.13
-#: Draws of a scene for a push: those next to the region; then so many in each strip so much farther off, m; all.
-_NEAR, _FEW, _FARTHER, _PUSHES = 400, 10, 0.02, 500
-#: Least distance of its middle from the far edge of the table, m.
-_FAR_EDGE = 0.06
+#: An object to push stands at most this much past the region, m.
+_FARTHER = 0.16
 _REGION = "work.region of robot.yaml"
 
 
@@ -87,28 +89,25 @@ def in_turn_task(seed: int) -> Task:
 
 
 def push_task(seed: int) -> Task:
-    """Request an object between the arms, turned so that neither can grasp it where it is.
-
-    Where arms grasp all that stands next to their region, it stands farther off.
-    """
-    rng, arms, number = np.random.default_rng([seed, 5]), RobotDescription.load().arm_names, itertools.count()
+    """Request an object between the arms that neither can grasp where it is, and one can push into reach."""
+    rng = np.random.default_rng([seed, 5])
 
     def draw() -> Task | None:
-        scene = _one_object(seed, rng, _FARTHER * max(0, (next(number) - _NEAR) // _FEW + 1))
-        if any(_graspable(scene, arm) for arm in arms):
+        scene = _one_object(seed, rng)
+        if not _to_push(scene):
             return None
         return Task("push", seed, scene, (scene.objects[0].label,), kind="push", route="push")
 
     begin = robot_work().region.x[1]
-    what = f"push {seed}: a box of 40 to 70 mm between the arms, x from {begin:g} m on, that neither can grasp"
-    return first_fit(what, f"enlarge {_REGION} to all that the arms grasp, or its table", draw, _PUSHES)
+    what = (
+        f"push {seed}: a box of 40 to 70 mm between the arms, x from {begin:g} m on, to be pushed before it is grasped"
+    )
+    return first_fit(what, f"enlarge {_REGION} to all that the arms grasp, or its table", draw)
 
 
-def _one_object(seed: int, rng: np.random.Generator, farther: float) -> Scene:
-    """Draw an object for `push_task` between the arms: past the region, or in the strip that is so much farther off."""
-    region, far = robot_work().region, within(robot_work().table.x, 0.0, _FAR_EDGE)[1]
-    low, high = past(region.x, 0.05 + farther if farther else 0.01, 0.07 + farther)
-    xs, half = (min(low, far), min(high, far)), region.abs_y[0] / 2.0
+def _one_object(seed: int, rng: np.random.Generator) -> Scene:
+    """Draw an object between the arms, past the region."""
+    region, half = robot_work().region, robot_work().region.abs_y[0] / 2.0
     color = str(rng.choice(list(PALETTE)))
     a, b, c = (round(float(edge), 3) for edge in rng.uniform((0.04, 0.04, 0.04), (0.07, 0.07, 0.06)))
     item = SceneObject(
@@ -116,30 +115,49 @@ def _one_object(seed: int, rng: np.random.Generator, farther: float) -> Scene:
         shape="box",
         size=(a, b, c),
         color=color,
-        position=(round(float(rng.uniform(*xs)), 3), round(float(rng.uniform(-half, half)), 3)),
+        position=(
+            round(float(rng.uniform(*past(region.x, 0.0, _FARTHER))), 3),
+            round(float(rng.uniform(-half, half)), 3),
+        ),
         yaw=round(float(rng.uniform(-np.pi, np.pi)), 3),
         mass=round(float(rng.uniform(0.06, 0.25)), 3),
     )
     return parse_scene({"name": f"push_{seed}", "objects": [item]}, f"push scene {seed}")
 
 
-def _graspable(scene: Scene, arm: str) -> bool:
-    """Whether an arm at home finds a plan for the first object, known without an error."""
-    table, item, config = scene.table, scene.objects[0], GraspConfig()
-    T = se3.make(se3.rot_z(item.yaw), item.centre(table))
-    target = Detection(item.label, 1.0, T, np.array(item.size))
+def _to_push(scene: Scene) -> bool:
+    """Whether arms at home find a plan to push the first object and then to grasp it, and none to grasp it at once."""
+    config, robot, item = GraspConfig(), RobotDescription.load(), scene.objects[0]
+    target = Detection(item.label, 1.0, se3.make(se3.rot_z(item.yaw), item.centre(scene.table)), np.array(item.size))
+    context = GraspContext.of(config, scene.table, robot)
+
+    def graspable(there: Detection) -> bool:
+        grasps = propose(there, config, context.hand)
+        return any(
+            _reaches(scene.table, arm, ways, there)
+            for arm in robot.arm_names
+            for ways in (grasps, tuple(shorter(one) for one in grasps))
+        )
+
+    def pushable(end: Array) -> bool:
+        ways = {arm: push_ways(target, end, config, closed_hand(robot, arm), context.hand) for arm in robot.arm_names}
+        return any(_reaches(scene.table, arm, behind, target) for arm, behind in ways.items())
+
+    ends = [end for end in destinations(target, (), context) if end[0] < target.p_base[0]]
+    return not graspable(target) and any(pushable(end) and graspable(standing_at(target, end)) for end in ends)
+
+
+def _reaches(table: Table, arm: str, ways: tuple[GraspCandidate, ...], target: Detection) -> bool:
+    """Whether an arm at home finds a plan for an object that is known without an error."""
     solver = arms_behind((), table)[arm]
-    grasps = propose(target, config, RobotDescription.load().hand(arm).parts)
-    for ways in (grasps, tuple(shorter(one) for one in grasps)):
-        request = approach_of(PlanGrasp(arm, ways, (), (target_box(target, config),)))
-        try:
-            plan_approach(solver, solver.start_state(_home()), request)
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-        else:
-            return True
-    return False
+    try:
+        request = approach_of(PlanGrasp(arm, ways, (), (target_box(target, GraspConfig()),)))
+        plan_approach(solver, solver.start_state(_home()), request)
+    except OpenArmError as error:
+        if error.code not in NO_WAY:
+            raise
+        return False
+    return True
 
 
 def _home() -> Mapping[str, float]:
