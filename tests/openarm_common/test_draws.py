@@ -61,9 +61,7 @@ def test_a_random_scene_has_as_many_objects_as_the_region_has_room_for(narrow):
 def test_a_suite_whose_scenes_do_not_fit_a_robot_says_so(monkeypatch):
     monkeypatch.setenv(ROBOT, "openarm_v2")
     monkeypatch.setattr(two_arms, "_to_push", lambda scene: False)
-    words = (
-        "push 7: a box of 40 to 70 mm between the arms, x from 0.35 m on, to be pushed before it is"
-    )
+    words = "push 7: a box of 40 to 70 mm between the arms, x from 0.35 m on, to be pushed before it is"
     error = refused(words, make_task, "push", 7)
     assert error.message.endswith("enlarge work.region of robot.yaml to all that the arms grasp, or its table")
     monkeypatch.setattr(two_arms, "random_scene", lambda seed, count: random_scene(3, count=1))
