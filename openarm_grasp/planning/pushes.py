@@ -205,7 +205,9 @@ def _outside(xy: Array, context: GraspContext, beyond: float = 0.0) -> Array:
 
 
 def destinations(target: Detection, others: Sequence[Detection], context: GraspContext) -> tuple[Array, ...]:
-    """Places around the object, on the table and free of others: short pushes first, then those to the sides.
+    """Places around the object, on the table and free of others.
+
+    Those nearest to where arms reach come first, then short pushes, then those to the sides.
 
     Args:
         target: The object.
@@ -214,15 +216,16 @@ def destinations(target: Detection, others: Sequence[Detection], context: GraspC
     """
     config, place, table = context.config.push, context.config.place, context.table
     p, half = target.p_base[:2], 0.5 * float(np.hypot(*target.size[:2]))
-    found: list[tuple[float, float, float, float]] = []
+    found: list[tuple[float, float, float, float, float]] = []
     for length, k in product(config.lengths, range(config.directions)):
         angle = 2.0 * pi * k / config.directions
         x, y = float(p[0] + length * cos(angle)), float(p[1] + length * sin(angle))
         room = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
         on_table = table.x[0] + half <= x <= table.x[1] - half and table.y[0] + half <= y <= table.y[1] - half
         if on_table and room >= place.neighbour_distance:
-            found.append((length, -round(abs(sin(angle)), 3), x, y))
-    return tuple(np.array([x, y]) for _, _, x, y in sorted(found))
+            off = round(float(np.linalg.norm(_outside(np.array([x, y]), context))), 3)
+            found.append((off, length, -round(abs(sin(angle)), 3), x, y))
+    return tuple(np.array([x, y]) for *_, x, y in sorted(found))
 
 
 def push_ways(

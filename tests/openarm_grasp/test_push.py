@@ -28,7 +28,7 @@ def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(two: World
     assert (outcome.code, outcome.route) == (Code.OK, "push")
     assert two.pushed == 1
     pusher = next(e.arm for e in two.done(Follow))
-    assert f"push 1 by the {pusher} hand moved it 60 mm" in outcome.message
+    assert f"push 1 by the {pusher} hand moved it 100 mm" in outcome.message
     assert pusher != outcome.arm  # the hand that comes from the other side pushes
     assert next(e for e in two.done(Grip)).position == 0.0
 
@@ -64,8 +64,9 @@ def test_a_push_that_the_object_does_not_follow_goes_another_way_next_and_is_rep
 
 
 @pytest.mark.requirement("N-13")
-def test_the_camera_verifies_a_push(two: World) -> None:
+def test_the_camera_verifies_a_push(robot) -> None:
     """Half of the way is seen as half of the way, and the rest is pushed again."""
+    two = robot(0.46, 0.02, far=0.40)
     two.follows = 0.5
     outcome = two.ask()
     assert outcome.code is Code.OK
