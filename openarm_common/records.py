@@ -2,7 +2,7 @@
 """Records that are kept: one YAML each, checked by its own hash, with history and rollback.
 
 Files are written to another name and renamed, so that a reader gets an old or a new one, never a part. A damaged file
-and one of another robot are refused, and the newest good one of the history takes their place.
+and one of another robot are passed over, and the newest good one of the history takes their place.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import yaml
 from pydantic import Field
@@ -29,12 +29,20 @@ from openarm_common.robot.folder import DEFAULT, other_robot, robot_name
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
-class OfAnotherRobot(OpenArmError):
-    """A file is of another robot than that of this process."""
-
-
 class Record(Config, ABC):
-    """What is stored under a name."""
+    """What is stored under a name.
+
+    Attributes:
+        place: Folder of its kind below that of the calibrations.
+        noun: What it is called in messages.
+        command: What makes one.
+        usual: Name of the one that is meant where none is named.
+    """
+
+    place: ClassVar[str] = ""
+    noun: ClassVar[str]
+    command: ClassVar[str]
+    usual: ClassVar[str] = ""
 
     robot: str = Field(
         default_factory=robot_name, description="that it is of; files of old do not say it and are of openarm_v1"
@@ -67,17 +75,16 @@ class Found(Generic[RecordT]):
 
 
 class RecordStore(Generic[RecordT]):
-    """A folder of records.
+    """The records of a kind, below a folder of calibrations; each of its folders is made at the first save.
 
     Args:
-        folder: Where; made at the first save.
-        kind: Their model.
-        noun: What they are called in messages, for example "calibration".
+        calibrations: Folder of the calibrations.
+        kind: Model of the records.
     """
 
-    def __init__(self, folder: Path, kind: type[RecordT], noun: str) -> None:
-        self.folder = folder
-        self._kind, self._noun = kind, noun
+    def __init__(self, calibrations: Path, kind: type[RecordT]) -> None:
+        self.folder = calibrations / kind.place
+        self.kind = kind
 
     def path(self, name: str) -> Path:
         """Return the file of a name.
@@ -115,29 +122,33 @@ class RecordStore(Generic[RecordT]):
         if not path.is_file():
             known = ", ".join(self.names()) or "none"
             raise OpenArmError(
-                Code.CONFIG_INVALID, f"no {self._noun} of {name!r} in {self.folder}; stored are: {known}"
+                Code.CONFIG_INVALID, f"no {self.kind.noun} of {name!r} in {self.folder}; stored are: {known}"
             )
-        return self._read(path)
+        record = self._read(path)
+        if text := _other_robot(record):
+            raise OpenArmError(Code.CONFIG_INVALID, f"{path} {text}")
+        return record
 
     def find(self, name: str) -> Found[RecordT] | None:
-        """Return what is stored under a name, or the newest good one before it; None when nothing was ever stored.
+        """Return what is stored of this process's robot under a name, or the newest good one before it; None of none.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the file is damaged and the history has no good one.
-            OfAnotherRobot: CONFIG_INVALID, when all that was stored is of another robot.
         """
-        if not self.path(name).is_file() and not self._past(name):
-            return None
+        path, fault = self.path(name), ""
         try:
-            return Found(self.load(name))
-        except OpenArmError as error:
-            good = self._good(name)
-            if not good:
-                raise
-            older, record = good[-1]
-            if isinstance(error, OfAnotherRobot):  # two robots have stored in turn, which is no fault
+            if path.is_file() and not _other_robot(record := self._read(path)):
                 return Found(record)
-            return Found(record, f"{error.message}; the last good one, {older.name}, is used")
+        except OpenArmError as error:
+            fault = error.message
+        if good := self._good(name):
+            older, record = good[-1]
+            return Found(record, f"{fault}; the last good one, {older.name}, is used" if fault else "")
+        if fault:
+            raise OpenArmError(
+                Code.CONFIG_INVALID, f"{fault}; remove it, then `{self.kind.command}` makes a new {self.kind.noun}"
+            )
+        return None
 
     def history(self, name: str) -> tuple[RecordT, ...]:
         """Return all good records of a name that are of this process's robot, oldest first."""
@@ -153,13 +164,15 @@ class RecordStore(Generic[RecordT]):
         if len(good) < 2:
             raise OpenArmError(
                 Code.CONFIG_INVALID,
-                f"going back needs a {self._noun} of {name!r} before the present one; stored: {len(good)}",
+                f"going back needs a {self.kind.noun} of {name!r} before the present one; stored: {len(good)}",
             )
         path, before = good[-2]
         write_whole(self.path(name), path.read_bytes())
         for later in past[past.index(path) + 1 :]:
-            if not self._is_of_another(later):
-                later.unlink()
+            with contextlib.suppress(OpenArmError):
+                if _other_robot(self._read(later)):
+                    continue
+            later.unlink()
         return before
 
     def state(self) -> tuple[tuple[str, int, int], ...]:
@@ -181,37 +194,27 @@ class RecordStore(Generic[RecordT]):
         out: list[tuple[Path, RecordT]] = []
         for path in self._past(name):
             with contextlib.suppress(OpenArmError):
-                out.append((path, self._read(path)))
+                if not _other_robot(record := self._read(path)):
+                    out.append((path, record))
         return out
 
     def _past(self, name: str) -> list[Path]:
         return sorted(self._history(name).glob("*.yaml"), key=_number)
 
-    def _is_of_another(self, path: Path) -> bool:
-        try:
-            self._read(path)
-        except OpenArmError as error:
-            return isinstance(error, OfAnotherRobot)
-        return False
-
     def _read(self, path: Path) -> RecordT:
-        """Read and check one file.
+        """Read and check one file of any robot.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when it is not as it was written.
-            OfAnotherRobot: CONFIG_INVALID, when it is not of the robot of this process.
         """
         data = {"robot": "", **load_yaml(path)}
         stated = data.pop("sha256", None)
-        record = validate(self._kind, data, str(path))
+        record = validate(self.kind, data, str(path))
         if stated != record.digest():
             raise OpenArmError(
                 Code.CONFIG_INVALID,
-                f"{path} is damaged or was edited: its contents do not have the hash that it states; calibrate and save"
-                " again, or roll back",
+                f"{path} is damaged or was edited: its contents do not have the hash that it states",
             )
-        if text := other_robot(record.robot or DEFAULT):
-            raise OfAnotherRobot(Code.CONFIG_INVALID, f"{path} {text}")
         return record
 
 
@@ -241,6 +244,10 @@ def default_folder() -> Path:
         return Path(given).expanduser()
     base = os.environ.get("XDG_DATA_HOME", "")
     return (Path(base) if base else Path.home() / ".local" / "share") / "openarm" / "calibrations"
+
+
+def _other_robot(record: Record) -> str:
+    return other_robot(record.robot or DEFAULT)
 
 
 def _number(path: Path) -> int:

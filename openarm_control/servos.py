@@ -15,10 +15,10 @@ from pydantic import Field, field_validator
 
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.records import default_folder
+from openarm_common.records import RecordStore, default_folder
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.motors import Gains, Numbers, Range
-from openarm_common.robot.servo_store import ServoStore
+from openarm_common.robot.servo_store import StoredServos
 from openarm_common.robot.servos import ArmLoad, ServoModel
 
 
@@ -111,7 +111,7 @@ class KnownServos:
         warn: Callable[[str], object],
     ) -> None:
         self._configured = dict(configured)
-        self._store = ServoStore(Path(folder) if folder else default_folder())
+        self._store = RecordStore(Path(folder) if folder else default_folder(), StoredServos)
         self._seed = dynamics_seed
         self._warn = warn
         self._read()

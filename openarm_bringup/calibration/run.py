@@ -25,7 +25,7 @@ from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder, now
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.zero_store import ZeroStore
+from openarm_common.robot.learned import LearnedStore, StoredZeros
 from openarm_common.robot.zeros import Zeros, keep_zeros
 from openarm_common.scene.boards import CALIBRATION, board_places, board_start
 
@@ -76,12 +76,12 @@ class CalibrationOptions:
     domain: int | None = None
     sets: tuple[str, ...] = ()
 
-    def stores(self) -> tuple[CalibrationStore, ZeroStore]:
+    def stores(self) -> tuple[CalibrationStore, LearnedStore[StoredZeros]]:
         """Return where mounts and zeros are stored."""
         from openarm_calibration.store.store import CalibrationStore
 
         folder = default_folder() if self.store is None else self.store.expanduser().absolute()
-        return CalibrationStore(folder), ZeroStore(self.zeros_store or folder)
+        return CalibrationStore(folder), LearnedStore(self.zeros_store or folder, StoredZeros)
 
     @property
     def goal(self) -> dict[str, Any]:
@@ -172,7 +172,7 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
     overrides = {"domain": domain, "scene": places[0].scene, "mount_seed": options.mount_seed}
     graph = load_graph(GRAPH, overrides=overrides, sets=sets)
     run = CalibrationRun(run_dir := runs.new_run_dir())
-    known = zeros.in_use(zeros_name(graph)).record
+    known = zeros.in_use(zeros_name(graph))
     keep_zeros(Zeros(robot=known.robot, of=known.of, offsets=known.offsets), run_dir / "zeros")
     listeners = listeners or CalibrationListeners()
     stop = threading.Event()
@@ -239,7 +239,7 @@ def together(sessions: Sequence[Path], level: float) -> ZerosCalibration:
     return calibrate_zeros(samples, ZerosConfig(level=level), hashes=hashes, created=now())
 
 
-def store_found(found: ZerosCalibration, mounts: CalibrationStore, zeros: ZeroStore) -> tuple[str, ...]:
+def store_found(found: ZerosCalibration, mounts: CalibrationStore, zeros: LearnedStore[StoredZeros]) -> tuple[str, ...]:
     """Store mounts and zeros that belong together, and return the files."""
     return (*(str(mounts.save(mount)) for mount in found.mounts), str(zeros.save(found.zeros)))
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from openarm_calibration.handeye.offline import Result
     from openarm_calibration.sampling.samples import SampleSet
     from openarm_calibration.store.store import CalibrationStore
-    from openarm_calibration.store.table import TableStore
-    from openarm_common.robot.zero_store import ZeroStore
+    from openarm_common.records import RecordStore
+    from openarm_common.robot.learned import LearnedStore, StoredZeros
 
 
 @Parameter(name="*")
@@ -142,7 +142,7 @@ def at_stored_zeros(samples: SampleSet, store: Path | None) -> SampleSet:
     of = samples.head.zeros_of
     if samples.foreign or (of == REAL and samples.head.mount_seed is not None):  # simulated, by an older version
         return samples
-    return samples.with_zeros(zeros_in(store).in_use(of).record.offsets)
+    return samples.with_zeros(zeros_in(store).in_use(of).offsets)
 
 
 def _from_session(path: Path, source: Source) -> tuple[SampleSet, str]:
@@ -192,18 +192,27 @@ def given_board(text: str) -> Board:
         raise OpenArmError(Code.INVALID_ARGUMENT, error.message) from error
 
 
-def tables_in(folder: Path | None) -> TableStore:
-    """Return the stored height of the table in a folder; errors as `store_in`."""
-    from openarm_calibration.store.table import TableStore
+def stored_in(folder: Path | None) -> dict[str, tuple[RecordStore[Any], str]]:
+    """Return all that is stored in a folder, as store and name, by what users call it; errors as `store_in`."""
+    from openarm_calibration.store.table import StoredTable
+    from openarm_common.records import RecordStore
+    from openarm_common.robot.learned import StoredHands, StoredZeros
+    from openarm_common.robot.servo_store import StoredServos
 
-    return TableStore(store_in(folder).folder)
+    cameras, out = store_in(folder), dict[str, tuple[RecordStore[Any], str]]()
+    kinds = (StoredTable, StoredZeros, StoredHands, StoredServos)
+    for stored in (cameras, *(RecordStore(cameras.folder, kind) for kind in kinds)):
+        place, usual = stored.kind.place, stored.kind.usual
+        for name in stored.names():
+            out[place if name == usual else f"{place}/{name}".lstrip("/")] = stored, name
+    return out
 
 
-def zeros_in(folder: Path | None) -> ZeroStore:
+def zeros_in(folder: Path | None) -> LearnedStore[StoredZeros]:
     """Return the stored zeros of the joints in a folder; errors as `store_in`."""
-    from openarm_common.robot.zero_store import ZeroStore
+    from openarm_common.robot.learned import LearnedStore, StoredZeros
 
-    return ZeroStore(store_in(folder).folder)
+    return LearnedStore(store_in(folder).folder, StoredZeros)
 
 
 def store_in(folder: Path | None) -> CalibrationStore:

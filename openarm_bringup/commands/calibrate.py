@@ -15,18 +15,16 @@ from openarm_bringup.calibration.source import (
     at_stored_zeros,
     given_board,
     store_in,
-    tables_in,
+    stored_in,
     with_solved,
-    zeros_in,
 )
 from openarm_bringup.commands import calibrate_foreign, calibrate_live, calibrate_touch, calibrate_zeros
 from openarm_bringup.outcome import Outcome
+from openarm_bringup.suggest import unknown
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.zeros import REAL
 
 if TYPE_CHECKING:
-    from openarm_calibration.store.store import CalibrationStore, StoredCalibration
-    from openarm_calibration.store.table import StoredTable
+    from openarm_calibration.store.store import CalibrationStore
 
 calibrate = App(name="calibrate", help="Hand-eye calibration: boards, sampling, solving, checking and storing.")
 
@@ -188,64 +186,55 @@ def report(samples: Path, out: Path, *, source: Source = ALL_SAMPLES) -> Outcome
 
 @calibrate.command(name="list")
 def list_(*, store: Path | None = None) -> Outcome:
-    """Name the stored calibrations, zeros of joints and the measured table, with their history.
+    """Name what is stored, with its history: calibrations, the table, zeros of joints, learned hands, servos.
 
     Args:
         store: Folder of stored calibrations.
     """
-    from openarm_calibration.store.table import TABLE
-
-    opened = store_in(store)
-    data: dict[str, Any] = {"store": str(opened.folder), "cameras": {}}
-    lines: list[str] = []
-    faults: list[str] = []
-    for camera in opened.names():
-        history = [item.model_dump(mode="json") for item in opened.history(camera)]
-        data["cameras"][camera] = {"history": history}
+    data: dict[str, Any] = {"store": str(store_in(store).folder), "cameras": {}}
+    lines, faults = list[str](), list[str]()
+    for label, (stored, name) in stored_in(store).items():
         try:
-            lines.append(_line(opened.load(camera)) + f"  ({len(history)} in its history)")
+            found = stored.find(name)
         except OpenArmError as error:
             faults.append(error.message)
-            lines.append(f"{camera}: {error.message}")
-    tables = tables_in(store)
-    if tables.names():
-        try:
-            kept = tables.load(TABLE)
-            data["table"] = kept.model_dump(mode="json")
-            lines.append(f"table: {_height(kept)}  ({len(tables.history(TABLE))} in its history)")
-        except OpenArmError as error:
-            faults.append(error.message)
-    known = zeros_in(store)
-    for of in known.names():
-        try:
-            found = known.load(of)
-            data.setdefault("zeros", {})[of] = found.model_dump(mode="json")
-            lines.append(f"{calibrate_zeros.line(found)}  ({len(known.history(of))} in its history)")
-        except OpenArmError as error:
-            faults.append(error.message)
+            lines.append(f"{label}: {error.message}")
+            continue
+        if found is None:  # of another robot
+            continue
+        faults += [found.warning] if found.warning else []
+        place, history = stored.kind.place, stored.history(name)
+        lines.append(f"{label}: {found.record}  ({len(history)} in its history)")
+        rows = data if place == "table" else data.setdefault(place or "cameras", {})  # there is one table
+        old = {"history": [item.model_dump(mode="json") for item in history]}
+        rows[name] = found.record.model_dump(mode="json") if place else old
     if faults:
         return Outcome(False, "; ".join(faults), Code.CONFIG_INVALID, data, "\n".join(lines))
-    return Outcome(True, f"{len(lines)} stored in {opened.folder}", data=data, text="\n".join(lines))
+    return Outcome(True, f"{len(lines)} stored in {data['store']}", data=data, text="\n".join(lines))
 
 
 @calibrate.command
-def rollback(camera: str, *, store: Path | None = None) -> Outcome:
-    """Go back to the calibration of a camera, the table's height, or the zeros of the joints before the present one.
+def rollback(name: str, *, store: Path | None = None) -> Outcome:
+    """Go back to what was stored before the present one; with zeros, to the mounts of before.
 
     Args:
-        camera: Its name; or "table"; or "zeros" (of a simulated robot as `list` names them), with the mounts then.
+        name: What `list` begins the line with: a camera, table, zeros, hands or servos/ARM; of a simulated robot such
+            as hands/simulated_openarm.
         store: Folder of stored calibrations.
     """
-    from openarm_calibration.store.table import TABLE
+    from openarm_common.robot.learned import Learned, StoredZeros
 
-    if camera == REAL or camera in zeros_in(store).names():
-        return calibrate_zeros.rolled_back(camera, store)
-
-    if camera == TABLE:
-        height = tables_in(store).rollback(TABLE)
-        return Outcome(True, f"now in use: table: {_height(height)}", data=height.model_dump(mode="json"))
-    now = store_in(store).rollback(camera)
-    return Outcome(True, f"now in use: {_line(now)}", data=now.model_dump(mode="json"))
+    known = stored_in(store)
+    if name not in known:
+        raise unknown("stored calibration", name, known)
+    stored, key = known[name]
+    left, now = stored.find(key), stored.rollback(key)
+    said = [f"now in use: {name}: {now}"]
+    if left is not None and isinstance(left.record, StoredZeros):
+        said += calibrate_zeros.mounts_rolled_back(left.record, store_in(store))
+    if isinstance(now, Learned):
+        said.append("start the graph again")
+    return Outcome(True, "; ".join(said), data=now.model_dump(mode="json"))
 
 
 def _json(done: Solved) -> dict[str, Any]:
@@ -266,18 +255,3 @@ def _outcome(done: Solved, store: CalibrationStore | None, *, force: bool = Fals
     if store is not None:
         message += "; not stored (--force of `openarm calibrate save` stores it all the same)"
     return Outcome(not failed, message, Code.DEGENERATE if failed else Code.OK, data, text)
-
-
-def _height(item: StoredTable) -> str:
-    seed = "none" if item.mount_seed is None else str(item.mount_seed)
-    return f"{item.height * 1e3:.1f} mm by {item.method or 'hand'}, mount seed {seed}, {item.created or 'undated'}"
-
-
-def _line(item: StoredCalibration) -> str:
-    x, y, z = (v * 1e3 for v in item.position)
-    seed = "none" if item.mount_seed is None else str(item.mount_seed)
-    return (
-        f"{item.camera}: {x:.2f}, {y:.2f}, {z:.2f} mm in {item.parent},"
-        f" accurate to {item.sigma_translation * 1e3:.3f} mm, {item.samples} samples,"
-        f" mount seed {seed}, {item.created or 'undated'}"
-    )

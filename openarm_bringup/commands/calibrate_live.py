@@ -174,12 +174,12 @@ def dynamics(*, arm: str = "both", postures: int = 6, dry_run: bool = False, dom
     """
     join_graph(domain)
     from openarm_bringup.calibration.ros.dynamics import DynamicsClient, named_arms
-    from openarm_common.records import default_folder
-    from openarm_common.robot.servo_store import ServoStore
+    from openarm_common.records import RecordStore, default_folder
+    from openarm_common.robot.servo_store import StoredServos
 
     if not LEAST_POSTURES <= postures <= MOST_POSES:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--postures {postures}: expected {LEAST_POSTURES} to {MOST_POSES}")
-    sides, store = named_arms(arm), ServoStore(default_folder())
+    sides, store = named_arms(arm), RecordStore(default_folder(), StoredServos)
     data, lines, show = dict[str, Any](), list[str](), _Show()
     with requires_node("motion", "motion"), DynamicsClient() as client:
         seed = client.dynamics_seed()

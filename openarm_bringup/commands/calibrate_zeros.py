@@ -16,7 +16,8 @@ from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
     from openarm_calibration.handeye.zero_sets import ZerosCalibration
-    from openarm_common.robot.zero_store import StoredZeros
+    from openarm_calibration.store.store import CalibrationStore
+    from openarm_common.robot.learned import StoredZeros
 
 
 def zeros(
@@ -87,19 +88,16 @@ def zeros(
     )
 
 
-def rolled_back(name: str, store: Path | None) -> Outcome:
-    """Go back to the zeros before the present ones, and to the mounts that were stored before theirs.
+def mounts_rolled_back(left: StoredZeros, mounts: CalibrationStore) -> list[str]:
+    """Go back to the mounts that were stored before those of zeros that were left; say what became of each.
 
     Args:
-        name: What the zeros are stored as.
-        store: Folder of stored calibrations.
+        left: The zeros.
+        mounts: Calibrations of the cameras.
     """
     from openarm_common.robot.zeros import zeros_label
 
-    known, mounts = zeros_in(store), store_in(store)
-    left = known.load(name)
-    now = known.rollback(name)
-    said = [f"now in use: {line(now)}"]
+    said = list[str]()
     for camera in left.cameras:
         found = mounts.find(camera)
         if found is None or found.record.zeros != zeros_label(left.offsets):
@@ -109,18 +107,7 @@ def rolled_back(name: str, store: Path | None) -> Outcome:
             said.append(f"{camera}: the mount before")
         except OpenArmError as error:
             said.append(f"{camera}: calibrate it again: {error.message}")
-    return Outcome(True, f"{'; '.join(said)}; start the graph again", data=now.model_dump(mode="json"))
-
-
-def line(record: StoredZeros) -> str:
-    """Return a line on stored zeros."""
-    if not any(record.offsets.values()):
-        return f"{record.name}: joints as described"
-    rms = math.sqrt(sum(value**2 for value in record.offsets.values()) / len(record.offsets))
-    return (
-        f"{record.name}: {len(record.offsets)} joints off by {math.degrees(rms):.2f}° rms, {record.samples} samples,"
-        f" with {', '.join(record.cameras)}, {record.created or 'undated'}"
-    )
+    return said
 
 
 def _prior(item: str) -> tuple[str, float]:

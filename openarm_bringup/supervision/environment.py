@@ -18,8 +18,7 @@ from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder
 from openarm_common.resources import config_dir, write_whole
-from openarm_common.robot.hand_store import HandStore
-from openarm_common.robot.zero_store import ZeroStore
+from openarm_common.robot.learned import LearnedStore, StoredHands, StoredZeros
 from openarm_common.robot.zeros import REAL, ZEROS, Zeros, keep_zeros
 
 #: Of one message through shared memory, MiB; a cloud of 640x480 points takes 3.7 MB.
@@ -93,9 +92,9 @@ def zeros_file(graph: Graph, run_dir: Path) -> Path:
     folder = run_dir / "zeros"
     if kept := sorted(folder.glob("*.yaml")):
         return kept[0]
-    record = ZeroStore(_folder(graph, "calibration_publisher", "store")).in_use(zeros_name(graph)).record
-    hands = HandStore(_folder(graph, "grasp", "calibrations")).in_use(record.of)
-    return keep_zeros(Zeros(robot=record.robot, of=record.of, offsets=record.offsets, hands=dict(hands)), folder)
+    record = LearnedStore(_folder(graph, "calibration_publisher", "store"), StoredZeros).in_use(zeros_name(graph))
+    hands = LearnedStore(_folder(graph, "grasp", "calibrations"), StoredHands).in_use(record.of).hands
+    return keep_zeros(Zeros(robot=record.robot, of=record.of, offsets=record.offsets, hands=hands), folder)
 
 
 def _folder(graph: Graph, node: str, parameter: str) -> Path:

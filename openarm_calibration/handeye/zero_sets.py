@@ -28,7 +28,7 @@ from openarm_calibration.store.store import StoredCalibration
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.zero_store import StoredZeros
+from openarm_common.robot.learned import StoredZeros
 
 #: Groups of poses that are left out in turn.
 _FOLDS = 5

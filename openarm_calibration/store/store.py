@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config, validate
 from openarm_common.errors import OpenArmError
-from openarm_common.records import Found, OfAnotherRobot, Record, RecordStore
+from openarm_common.records import Found, Record, RecordStore
 from openarm_common.robot.folder import robot_folder
 from openarm_common.types import Array
 
@@ -62,6 +62,9 @@ _FORMAT = 1
 
 class StoredCalibration(Record):
     """The mount of one camera and where it comes from."""
+
+    noun: ClassVar[str] = "calibration"
+    command: ClassVar[str] = "openarm calibrate auto"
 
     format: int = Field(default=_FORMAT, ge=_FORMAT, le=_FORMAT, description="of this file")
     camera: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="name of the camera")
@@ -126,6 +129,15 @@ class StoredCalibration(Record):
         """The camera."""
         return self.camera
 
+    def __str__(self) -> str:
+        """Return the mount, how exact it is, and when it was found."""
+        x, y, z = (value * 1e3 for value in self.position)
+        seed = "none" if self.mount_seed is None else str(self.mount_seed)
+        return (
+            f"{x:.2f}, {y:.2f}, {z:.2f} mm in {self.parent}, accurate to {self.sigma_translation * 1e3:.3f} mm,"
+            f" {self.samples} samples, mount seed {seed}, {self.created or 'undated'}"
+        )
+
     def fields(self) -> dict[str, Any]:
         """Return what is written and hashed; a file of old lacks intrinsics, zeros or robot, and keeps its hash."""
         absent = {key for key in ("intrinsics", "zeros") if not getattr(self, key)}
@@ -136,18 +148,15 @@ class CalibrationStore(RecordStore[StoredCalibration]):
     """A folder of calibrations, one of each camera.
 
     Args:
-        folder: Where; made at the first save.
+        calibrations: Folder of the calibrations; made at the first save.
     """
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder, StoredCalibration, "calibration")
+    def __init__(self, calibrations: Path) -> None:
+        super().__init__(calibrations, StoredCalibration)
 
     def in_use(self, camera: str, mount_seed: int | None) -> StoredCalibration | None:
         """Return what is stored of a camera; None also for other mounts or robots, whose distance says nothing."""
-        try:
-            found = self.find(camera)
-        except OfAnotherRobot:
-            return None
+        found = self.find(camera)
         return found.record if found is not None and found.record.mount_seed == mount_seed else None
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import ClassVar
 
 from pydantic import Field
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.records import OfAnotherRobot, Record, RecordStore
+from openarm_common.records import Record, RecordStore
 
 #: Name of the record, and of the folder below that of the calibrations.
 TABLE = "table"
@@ -19,6 +20,11 @@ MAX_TILT_DEG = 1.4
 
 class StoredTable(Record):
     """A measured height of the table."""
+
+    place: ClassVar[str] = TABLE
+    noun: ClassVar[str] = "height"
+    command: ClassVar[str] = "openarm calibrate table"
+    usual: ClassVar[str] = TABLE
 
     format: int = Field(default=1, ge=1, le=1, description="of this file")
     height: float = Field(ge=0.05, le=1.2, description="of the table top in the base frame, m")
@@ -34,16 +40,21 @@ class StoredTable(Record):
         """The only one there is."""
         return TABLE
 
+    def __str__(self) -> str:
+        """Return the height, how and when it was measured."""
+        seed = "none" if self.mount_seed is None else str(self.mount_seed)
+        return f"{self.height * 1e3:.1f} mm by {self.method or 'hand'}, mount seed {seed}, {self.created or 'undated'}"
+
 
 class TableStore(RecordStore[StoredTable]):
     """The height of the table, below a folder of calibrations.
 
     Args:
-        folder: Folder of the calibrations.
+        calibrations: Folder of the calibrations.
     """
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder / TABLE, StoredTable, "height")
+    def __init__(self, calibrations: Path) -> None:
+        super().__init__(calibrations, StoredTable)
 
     def in_use(self, configured: float, mount_seed: int | None) -> tuple[float, str, str]:
         """Return the height of the table (m), where it is from, and what is wrong with what is stored.
@@ -55,8 +66,6 @@ class TableStore(RecordStore[StoredTable]):
         nominal = "of the scene"
         try:
             found = self.find(TABLE)
-        except OfAnotherRobot as error:
-            return configured, f"{nominal}; {error.message}", ""
         except OpenArmError as error:
             return configured, nominal, error.message
         if found is None:

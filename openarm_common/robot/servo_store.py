@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from openarm_common.records import Record, RecordStore
+from openarm_common.records import Record
 from openarm_common.robot.servos import ServoModel
 
 
 class StoredServos(Record):
     """Servos of an arm: values and standard deviations by joint, from the shoulder."""
+
+    place: ClassVar[str] = "servos"
+    noun: ClassVar[str] = "identification"
+    command: ClassVar[str] = "openarm calibrate dynamics"
 
     format: int = Field(default=1, ge=1, le=1, description="of this file")
     arm: str = Field(description="name of the arm")
@@ -35,18 +39,13 @@ class StoredServos(Record):
         """The arm."""
         return self.arm
 
+    def __str__(self) -> str:
+        """Return the gains, and when they were identified."""
+        seed = "none" if self.dynamics_seed is None else str(self.dynamics_seed)
+        gains = ", ".join(f"{gain:.0f}" for gain in self.stiffness)
+        return f"gains {gains} N m/rad, dynamics seed {seed}, {self.created or 'undated'}"
+
     def model(self) -> ServoModel:
         """Return them for a carrier; what is identified are servos that leave the weight to the client."""
         arrays = (self.stiffness, self.damping, self.friction, self.armature, self.latency)
         return ServoModel(*map(np.array, arrays), weight=1.0)
-
-
-class ServoStore(RecordStore[StoredServos]):
-    """The servos of arms, below a folder of calibrations.
-
-    Args:
-        folder: Folder of the calibrations.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder / "servos", StoredServos, "identification")

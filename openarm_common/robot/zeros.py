@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The zeros of the joints, and the reach of the hands, that hold in a process: a file, which `OPENARM_ZEROS` names.
 
-It holds for processes that this one starts, too. Whoever starts a graph writes what is stored (see `zero_store` and
-`hand_store`) into its run folder, so that all its nodes have the same zeros from their start to their end. rad.
+It holds for processes that this one starts, too. Whoever starts a graph writes what is stored (see `learned`)
+into its run folder, so that all its nodes have the same zeros from their start to their end. rad.
 """
 
 from __future__ import annotations

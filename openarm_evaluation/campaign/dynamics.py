@@ -12,8 +12,9 @@ import numpy as np
 from openarm_calibration.dynamics.excite import postures, waves
 from openarm_calibration.dynamics.identify import Identified, ServoLog, identify
 from openarm_common.errors import OpenArmError
+from openarm_common.records import RecordStore
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.servo_store import ServoStore
+from openarm_common.robot.servo_store import StoredServos
 from openarm_common.robot.servos import ArmLoad, ServoModel
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Array
@@ -107,7 +108,7 @@ def with_servos(task: Task, options: CampaignOptions, folder: Path) -> tuple[Tas
     hardware = suite_config(options.graph_parameters()).bridge.hardware.of_seed(seed)
     if not options.identify or hardware.of(robot).gravity_compensation == 1.0:
         return task, None
-    store, arms = ServoStore(folder / str(seed)), robot.arm_names
+    store, arms = RecordStore(folder / str(seed), StoredServos), robot.arm_names
     if any(store.find(arm) is None for arm in arms):
         for side, found in DynamicsBench(hardware).identified().items():
             store.save(found.record(side, seed))

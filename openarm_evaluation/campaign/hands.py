@@ -9,7 +9,7 @@ from pathlib import Path
 
 from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.hand_store import HandStore
+from openarm_common.robot.learned import LearnedStore, StoredHands, keep_hand
 from openarm_common.robot.zeros import HandReach
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.campaign.in_process_robot import InProcessRobot
@@ -36,16 +36,16 @@ def with_hands(task: Task, options: CampaignOptions, folder: Path) -> tuple[Task
     if not options.hand_seeds:
         return task, {}
     seed = options.hand_seeds[task.seed % len(options.hand_seeds)]
-    task, store, name = replace(task, hand_seed=seed), HandStore(folder), f"hand_seed_{seed}"
-    robot, sets, known = RobotDescription.load(), options.graph_parameters(), store.in_use(name)
+    task, store, name = replace(task, hand_seed=seed), LearnedStore(folder, StoredHands), f"hand_seed_{seed}"
+    robot, sets, known = RobotDescription.load(), options.graph_parameters(), store.in_use(name).hands
     config = suite_config(sets)
     if missing := [arm for arm in robot.hands if arm not in known]:
         senses = SimulatedSenses(sets=sets)
         link = InProcessRobot(SimRobot(load_scene("empty"), senses, dynamics_seed=1, hand_seed=seed), config.grasp)
         for arm in missing:
             reach = link.run(learn_hand(Skills(link, config.grasp), arm, config.grasp.timing.settle_limit))
-            store.keep(name, arm, reach)
-        known = store.in_use(name)
+            keep_hand(folder, name, arm, reach)
+        known = store.in_use(name).hands
     stops = drawn(config.bridge.hardware.of_seed(None, seed), robot.described).fingers
     true = robot.with_hands({arm: HandReach(closed=one.closed, opened=one.opened) for arm, one in stops.items()})
     context = GraspContext.of(config.grasp, task.scene.table, true)

@@ -17,7 +17,7 @@ from openarm_calibration.store.store import of_these_mounts, places
 from openarm_common.camera.cameras import load_cameras, true_mount, uncertain_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder
-from openarm_common.robot.zero_store import ZeroStore
+from openarm_common.robot.learned import LearnedStore, StoredZeros
 
 
 def uncalibrated(mount_seed: int) -> tuple[str, ...]:
@@ -44,7 +44,7 @@ def calibrate_once(mount_seed: int, on_note: Callable[[str], None]) -> None:
     on_note(f"no calibration of mount seed {mount_seed} yet: {', '.join(cameras)} are calibrated first, once")
     store = default_folder() / f"mount_seed_{mount_seed}"
     listeners = CalibrationListeners(on_camera=lambda camera: on_note(f"calibrating {camera}"))
-    zeros = not ZeroStore(default_folder()).history(zeros_name(load_graph(GRAPH)))
+    zeros = not LearnedStore(default_folder(), StoredZeros).history(zeros_name(load_graph(GRAPH)))
     options = CalibrationOptions(
         cameras, mount_seed=mount_seed, save=True, zeros=zeros, zeros_store=default_folder(), store=store
     )

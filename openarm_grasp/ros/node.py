@@ -25,7 +25,7 @@ from visualization_msgs.msg import MarkerArray
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder
-from openarm_common.robot.hand_store import HandStore
+from openarm_common.robot.learned import keep_hand
 from openarm_common.robot.zeros import keep_zeros, read_zeros, zeros_of, zeros_path
 from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
@@ -176,7 +176,7 @@ class GraspNode(BaseNode[GraspConfig]):
         """Learn a hand, use it as it is from now on, and store it; return what was learned, in a sentence."""
         reach = await learn_hand(self._skills, arm, self.config.timing.settle_limit)
         folder = Path(self.config.calibrations).expanduser() if self.config.calibrations else default_folder()
-        path = HandStore(folder).keep(zeros_of(), arm, reach)
+        path = keep_hand(folder, zeros_of(), arm, reach)
         if run := zeros_path():  # of nodes of this run that start again
             held = read_zeros(Path(run))
             keep_zeros(held.model_copy(update={"hands": {**held.hands, arm: reach}}), Path(run).parent)

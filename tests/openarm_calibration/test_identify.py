@@ -12,8 +12,9 @@ from openarm_calibration.dynamics import excite
 from openarm_calibration.dynamics.excite import AMPLITUDE, postures, waves
 from openarm_calibration.dynamics.identify import ServoLog, identify
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.records import RecordStore
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.servo_store import ServoStore
+from openarm_common.robot.servo_store import StoredServos
 from openarm_common.robot.servos import ArmLoad
 from openarm_evaluation.campaign import dynamics
 from openarm_evaluation.campaign.dynamics import DynamicsBench
@@ -46,7 +47,7 @@ def test_the_servos_of_drawn_arms_are_found(
     monkeypatch.setattr(dynamics, "_POSTURES", places)
     monkeypatch.setattr(excite, "_CYCLES", cycles)
     description, bench = RobotDescription.load(), DynamicsBench(hardware)
-    made, store = drawn(hardware, description), ServoStore(tmp_path)
+    made, store = drawn(hardware, description), RecordStore(tmp_path, StoredServos)
     monkeypatch.setattr(RobotDescription, "arm_names", sides)
     for side, found in bench.identified().items():
         joints = description.arm_joints(side)

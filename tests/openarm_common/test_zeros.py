@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openarm_common.records import OfAnotherRobot
 from openarm_common.robot import folder
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.zero_store import StoredZeros, ZeroStore
+from openarm_common.robot.learned import LearnedStore, StoredZeros
 from openarm_common.robot.zeros import ZEROS, Zeros, keep_zeros, zeros_label
 from tests.refusals import refused
 
@@ -85,17 +84,16 @@ def test_a_process_loads_its_robot_with_the_zeros_of_the_file_that_the_environme
 def test_the_way_back_from_the_first_zeros_leads_to_the_description(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store = ZeroStore(tmp_path)
-    assert store.in_use("zeros").record.offsets == {}
+    store = LearnedStore(tmp_path, StoredZeros)
+    assert store.in_use("zeros").offsets == {}
     store.save(StoredZeros(offsets={JOINTS[2]: 0.03}))
     store.save(StoredZeros(offsets={JOINTS[2]: 0.05}))
     assert store.rollback("zeros").offsets == {JOINTS[2]: 0.03}
     assert store.rollback("zeros").offsets == {}
     refused("going back needs", store.rollback, "zeros")
     monkeypatch.setenv(folder.ROBOT, "panda")
-    with pytest.raises(OfAnotherRobot):
-        store.load("zeros")
-    assert store.in_use("zeros").record.offsets == {}
+    refused("is of robot 'openarm_v1', expected 'panda'", store.load, "zeros")
+    assert store.in_use("zeros").offsets == {}
 
 
 def test_labels_tell_zeros_apart_and_none_has_no_label() -> None:

@@ -23,8 +23,8 @@ from openarm_bringup.commands.calibrate_live import dynamics
 from openarm_bringup.outcome import Outcome
 from openarm_calibration.dynamics import excite
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.records import default_folder
-from openarm_common.robot.servo_store import ServoStore, StoredServos
+from openarm_common.records import RecordStore, default_folder
+from openarm_common.robot.servo_store import StoredServos
 from openarm_common.robot.servos import ArmLoad
 from openarm_common.ros.convert import ns_to_stamp, trajectory_from_msg
 from openarm_sim_bridge.world.hardware import HardwareConfig, drawn
@@ -46,7 +46,7 @@ def taken_over(bench, done: Outcome) -> StoredServos:
     """The servos of the right arm that were identified and stored, once the bridge carries the arm by them."""
     assert done.success, done.message
     assert "joint  gain, N m/rad" in done.text
-    stored = ServoStore(default_folder()).load("right")
+    stored = RecordStore(default_folder(), StoredServos).load("right")
     assert stored.dynamics_seed == 7
     servos, expected = bench.node._face._servos, f"identified {stored.digest()[:12]}"
     bench.ros.spin_until(lambda: servos.sources["right"] == expected, what="the bridge to use them")

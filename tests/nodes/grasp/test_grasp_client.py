@@ -12,7 +12,7 @@ from visualization_msgs.msg import MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.hand_store import HandStore
+from openarm_common.robot.learned import LearnedStore, StoredHands
 from openarm_common.robot.zeros import ZEROS, Zeros, keep_zeros, read_zeros
 from openarm_common.ros import client
 from openarm_common.ros.node import QOS_LATCHED
@@ -122,15 +122,15 @@ def test_a_node_that_starts_with_a_full_hand_names_what_it_holds_and_the_client_
 
 
 @pytest.fixture
-def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> HandStore:
+def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LearnedStore[StoredHands]:
     """Where hands are stored, and the file of a run that has begun without any."""
     monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path))
     monkeypatch.setenv(ZEROS, str(keep_zeros(Zeros(robot="openarm_v1", of="bench", offsets={}), tmp_path / "run")))
-    return HandStore(tmp_path)
+    return LearnedStore(tmp_path, StoredHands)
 
 
 def test_a_hand_is_learned_for_this_run_and_those_to_come_and_works_with_the_width_that_it_has(
-    ros, stored: HandStore, tmp_path: Path
+    ros, stored: LearnedStore[StoredHands], tmp_path: Path
 ) -> None:
     bench = Bench(ros)
     bench.world.stops = (0.0016, 0.038)
@@ -148,13 +148,13 @@ def test_a_hand_is_learned_for_this_run_and_those_to_come_and_works_with_the_wid
         "gripper 0",
         "gripper 0.038",
     ]
-    hands = stored.in_use("bench")
+    hands = stored.in_use("bench").hands
     assert list(hands) == ["right"]
     assert read_zeros(tmp_path / "run" / "bench.yaml").hands == hands
 
 
 def test_where_it_is_allowed_unknown_hands_are_learned_before_the_first_request_and_full_ones_refused(
-    ros, stored: HandStore
+    ros, stored: LearnedStore[StoredHands]
 ) -> None:
     bench = Bench(ros, learn=True)
     finger = RobotDescription.load().finger_joint("left")
@@ -170,4 +170,4 @@ def test_where_it_is_allowed_unknown_hands_are_learned_before_the_first_request_
     assert second.success, second.message
     assert bench.world.log[:6] == ["gripper 0", "gripper 0.044", "gripper 0"] * 2
     assert bench.world.log.count("gripper 0.044") == 2
-    assert sorted(stored.in_use("bench")) == ["left", "right"]
+    assert sorted(stored.in_use("bench").hands) == ["left", "right"]

@@ -12,7 +12,7 @@ from openarm_bringup.supervision.environment import zeros_file
 from openarm_bringup.supervision.graph import load_graph
 from openarm_common.robot import folder
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.hand_store import HandStore
+from openarm_common.robot.learned import LearnedStore, StoredHands, keep_hand
 from openarm_common.robot.zeros import ZEROS, HandReach
 from tests.refusals import refused
 
@@ -43,35 +43,39 @@ def test_what_no_hand_reads_is_refused(wrong: dict[str, object]) -> None:
 def test_hands_are_kept_beside_each_other_with_their_history_and_apart_by_robot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store = HandStore(tmp_path)
-    assert store.in_use("zeros") == {}
-    store.keep("zeros", "left", REACH)
+    store = LearnedStore(tmp_path, StoredHands)
+    assert store.in_use("zeros").hands == {}
+    keep_hand(tmp_path, "zeros", "left", REACH)
     other = REACH.model_copy(update={"closed": 0.0})
-    store.keep("zeros", "right", other)
-    assert store.in_use("zeros") == {"left": REACH, "right": other}
-    assert store.in_use("simulated_openarm") == {}
-    store.keep("zeros", "left", other)
+    keep_hand(tmp_path, "zeros", "right", other)
+    assert store.in_use("zeros").hands == {"left": REACH, "right": other}
+    assert store.in_use("simulated_openarm").hands == {}
+    keep_hand(tmp_path, "zeros", "left", other)
     assert store.rollback("zeros").hands == {"left": REACH, "right": other}
     with monkeypatch.context() as patched:
         patched.setenv(folder.ROBOT, "panda")
-        assert store.in_use("zeros") == {}
-        store.keep("zeros", "right", other)
-    assert store.in_use("zeros") == {"left": REACH, "right": other}
+        assert store.find("zeros") is None
+        assert store.in_use("zeros").hands == {}
+        keep_hand(tmp_path, "zeros", "right", other)
+    assert store.in_use("zeros").hands == {"left": REACH, "right": other}
+    assert store.rollback("zeros").hands == {"left": REACH}
+    assert store.rollback("zeros").hands == {}
+    refused("going back needs a learned hand", store.rollback, "zeros")
 
 
 def test_a_damaged_file_is_refused_with_what_to_type_and_learning_replaces_it(tmp_path: Path) -> None:
-    store = HandStore(tmp_path)
+    store = LearnedStore(tmp_path, StoredHands)
     store.path("zeros").parent.mkdir()
     store.path("zeros").write_text("hands: {left: {closed: 1}}")
-    refused("or remove it, and learn the hands again: `openarm hardware learn-hand`", store.in_use, "zeros")
-    store.keep("zeros", "left", REACH)
-    assert store.in_use("zeros") == {"left": REACH}
+    refused("remove it, then `openarm hardware learn-hand` makes a new learned hand", store.in_use, "zeros")
+    keep_hand(tmp_path, "zeros", "left", REACH)
+    assert store.in_use("zeros").hands == {"left": REACH}
 
 
 def test_a_graph_starts_with_the_hands_of_its_own_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = f"grasp.calibrations={tmp_path}"
     seeded = load_graph("sim", sets=(kept, "mujoco_bridge.openarm.hand_seed=3"))
-    HandStore(tmp_path).keep("simulated_openarm_hand_seed_3", "right", REACH)
+    keep_hand(tmp_path, "simulated_openarm_hand_seed_3", "right", REACH)
     for name, graph, opened in (
         ("seeded", seeded, 0.038),
         ("drawn", load_graph("sim", sets=(kept,)), 0.044),
