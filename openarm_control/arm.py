@@ -26,6 +26,7 @@ from openarm_control.trajectory import (
     Trajectory,
     TrajectoryError,
     TrajectoryResult,
+    check_speed,
     checked,
 )
 
@@ -48,6 +49,11 @@ class TrajectoryConfig(Config):
         default="replace", description="what a goal does that comes while the arm follows another"
     )
     carrier: CarrierConfig = CarrierConfig()
+    first_velocity: float = Field(
+        default=0.3,
+        gt=0.0,
+        description="largest speed of a joint until its arm has arrived once, after a motor of it lost a turn, rad/s",
+    )
     command_timeout: float = Field(
         default=0.5, gt=0.0, le=60.0, description="arm and gripper hold when no /joint_commands came for so long, s"
     )
@@ -123,6 +129,11 @@ class TrajectoryFollower(Follower):
         """See `Follower.busy`."""
         return self._goal is not None
 
+    @property
+    def fastest(self) -> float:
+        """Largest speed of a joint that is followed now beyond the limits of the joints, rad/s."""
+        return self._config.first_velocity if self.careful else np.inf
+
     def check(self, trajectory: Trajectory) -> Trajectory:
         """Return the trajectory in the order of the joints.
 
@@ -156,7 +167,7 @@ class TrajectoryFollower(Follower):
         Raises:
             TrajectoryError: OLD_HEADER_TIMESTAMP, when it would have ended already; PATH_TOLERANCE_VIOLATED, when it
                 starts elsewhere; INVALID_GOAL, when its first point can't be reached in time or its start is far away,
-                or the arm is busy and new goals are refused.
+                the arm is careful and it is fast, or the arm is busy and new goals are refused.
         """
         if self._goal is not None and self._config.new_goal == "refuse":
             raise TrajectoryError(
@@ -183,7 +194,7 @@ class TrajectoryFollower(Follower):
         if self._goal is not None:
             self._advance(self._goal, t_ns, dt_ns)
         elif not np.array_equal(self._target, self._command.position):
-            self._command.step(self._target, dt)
+            self._command.step(self._target, dt, self.fastest)
         slip = desired_velocity - velocity
         target = self._carrier.target(self._command.position, self._command.velocity, error, slip, dt)
         self.state = FollowerState(t_ns, elapsed, desired, desired_velocity, position, velocity, target)
@@ -299,6 +310,12 @@ class TrajectoryFollower(Follower):
         else:
             self._check_start(q[0], measured, path)
             offset = command - q[0]
+        if self.careful:
+            why = (
+                f" until this arm has arrived once: {self.careful}; send it slower, or have /motion/move plan it, which"
+                " keeps this limit"
+            )
+            check_speed(t, q, v, np.minimum(self.group.max_velocity, self.fastest), self.group, why)
         return _Goal(
             spline=JointSpline(t, q, v, a),
             start_ns=start_ns,
@@ -339,6 +356,7 @@ class TrajectoryFollower(Follower):
     def _finish(self, end: End, result: TrajectoryResult, text: str) -> None:
         if self._goal is not None:
             done, self._goal = self._goal.done, None
+            self.careful = "" if end is End.SUCCEEDED else self.careful
             done(TrajectoryOutcome(end, result, text))
 
 

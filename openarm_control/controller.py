@@ -180,6 +180,12 @@ class RobotController(JointController):
         for follower, _ in self._followers:
             follower.stop(why)
 
+    def be_careful(self, joints: Sequence[str], why: str) -> None:
+        """Let the arms and grippers of some joints move slowly until a goal is reached."""
+        for follower, _ in self._followers:
+            if not set(joints).isdisjoint(follower.group.names):
+                follower.careful = why
+
     def abort(self, why: str) -> None:
         """Give up all goals, because the physics diverged."""
         for follower, _ in self._followers:

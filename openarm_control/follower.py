@@ -84,6 +84,8 @@ class Follower(ABC):
         self.group = group
         self._command = command
         self._target: Array = command.position.copy()
+        #: Why it moves slowly until a goal is reached; nothing: it does not.
+        self.careful = ""
 
     @property
     def commanded(self) -> Array:

@@ -33,6 +33,9 @@ class GripperConfig(Config):
     """How grippers move and when they are done."""
 
     velocity: float = Field(default=0.075, gt=0.0, description="largest speed of a finger, m/s: 0.044 m in 0.6 s")
+    first_velocity: float = Field(
+        default=0.0075, gt=0.0, description="the same until a goal is reached, after its motor lost a turn, m/s"
+    )
     acceleration: float = Field(default=1.0, gt=0.0, description="largest acceleration of a finger, m/s2")
     goal_tolerance: float = Field(default=0.001, gt=0.0, description="a finger this near its goal has reached it, m")
     stall_velocity: float = Field(default=0.001, gt=0.0, description="a finger slower than this does not move, m/s")
@@ -160,7 +163,8 @@ class GripperFollower(Follower):
         if self._done is not None:
             self._judge(t_ns, dt_ns, float(position[0]), float(velocity[0]), float(effort[0]))
         if self._command.position[0] != self._target[0]:
-            self._command.step(self._target, dt_ns * 1e-9, self._velocity)
+            fastest = self._config.first_velocity / self._lever if self.careful else self._velocity
+            self._command.step(self._target, dt_ns * 1e-9, min(self._velocity, fastest))
         return self._command.position
 
     def _judge(self, t_ns: int, dt_ns: int, position: float, velocity: float, effort: float) -> None:
@@ -198,4 +202,5 @@ class GripperFollower(Follower):
     ) -> None:
         if self._done is not None:
             done, self._done = self._done, None
+            self.careful = "" if end is End.SUCCEEDED else self.careful
             done(GripperOutcome(end, position, effort, stalled, reached, text))

@@ -119,7 +119,7 @@ def checked(trajectory: Trajectory, group: JointGroup) -> Trajectory:
     a = None if trajectory.a is None or v is None else _column(trajectory.a, t.size, order, group, "acceleration")
     _check_times(t)
     _check_limits(q, group)
-    _check_speed(t, q, v, group)
+    check_speed(t, q, v, group.max_velocity, group)
     for what, tolerances in (("path", trajectory.path_tolerance), ("goal", trajectory.goal_tolerance)):
         for name, tolerance in tolerances.items():
             if name not in group.names or not np.isfinite(tolerance):
@@ -181,16 +181,21 @@ def _check_limits(q: Array, group: JointGroup) -> None:
         )
 
 
-def _check_speed(t: Array, q: Array, v: Array | None, group: JointGroup) -> None:
+def check_speed(t: Array, q: Array, v: Array | None, fastest: Array, group: JointGroup, why: str = "") -> None:
+    """Refuse a trajectory that is too fast or does not end at rest; `why` follows the limit in the message.
+
+    Raises:
+        TrajectoryError: INVALID_GOAL, naming joint, place and speed.
+    """
     between = np.abs(np.diff(q, axis=0)) / np.diff(t)[:, None]
     at = np.zeros_like(q) if v is None else np.abs(v)
     for speeds, where in ((between, "between point {0} and the next"), (at, "at point {0}")):
-        fast = np.argwhere(speeds > group.max_velocity * (1.0 + 1e-6))
+        fast = np.argwhere(speeds > fastest * (1.0 + 1e-6))
         if fast.size:
             i, j = fast[0]
             raise TrajectoryError(
                 f"{group.names[j]} would have to move at {speeds[i, j]:.2f} rad/s {where.format(i)}, its limit is"
-                f" {group.max_velocity[j]:.2f}",
+                f" {fastest[j]:.2f}{why}",
                 code=Code.LIMITS,
             )
     moving = np.flatnonzero(at[-1] > _END_VELOCITY)

@@ -29,6 +29,8 @@ from openarm_hardware.touch import TouchGuard
 _STEP = 0.1
 #: In these, what is commanded already is commanded again; before, where the joints are.
 _HOLDING = (Phase.RAMPING, Phase.FOLLOWING, Phase.HELD)
+#: In these, it is known how many turns the motors have lost, and the arm has not moved since.
+_RISING = (Phase.SETTING, Phase.ENABLING, Phase.RAMPING)
 
 
 class MotorDriver:
@@ -131,7 +133,10 @@ class MotorDriver:
         return positions + np.where(soft, sign * torques / np.where(soft, self._kp, 1.0), 0.0)
 
     def _stay(self, state: State, position: Array) -> None:
-        """Command that arms stay, because none of them follows commands."""
+        """Command that arms stay, because none of them follows commands; first motions of lost turns will be slow."""
+        rises = {arm for arm, phase in zip(self._arm_of, state.phases, strict=True) if phase in _RISING}
+        turned = [a.joint for a, m in zip(self._axes, state.motors, strict=True) if m.turn and a.arm in rises]
+        self._controller.be_careful(turned, "a motor lost a turn")
         holds = {arm: phase in _HOLDING for arm, phase in zip(self._arm_of, state.phases, strict=True)}
         joints = [
             (motor.command if holds[axis.arm] else float(q), limit if axis.grips else float(weight))

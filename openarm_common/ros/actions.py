@@ -55,6 +55,11 @@ def owner_topic(action_name: str) -> str:
     return f"{action_name.rpartition('/')[0]}/owner"
 
 
+def fastest_topic(action_name: str) -> str:
+    """Return the topic on which a trajectory controller publishes the largest speed that it follows now, rad/s."""
+    return f"{action_name.rpartition('/')[0]}/fastest"
+
+
 def show_life(node: Node) -> None:
     """Let clients of this machine notice at once when the process of a node ends, and soon when its executor hangs."""
     if node in _BEATING:

@@ -11,6 +11,7 @@ end, as with ros2_control.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -19,11 +20,12 @@ from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action.server import ServerGoalHandle
 from rclpy.duration import Duration as RclDuration
+from std_msgs.msg import Float64
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from openarm_common import lifeline
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.actions import latest, owner_topic
+from openarm_common.ros.actions import fastest_topic, latest, owner_topic
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_common.types import Array
@@ -38,7 +40,7 @@ _SILENT_S = 2.0
 
 
 class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
-    """/{side}_joint_trajectory_controller: follow_joint_trajectory, and the topics joint_trajectory, controller_state.
+    """/{side}_joint_trajectory_controller: follow_joint_trajectory, joint_trajectory, controller_state, fastest.
 
     Args:
         node: Owner.
@@ -77,7 +79,9 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         self._states = node.create_publisher(JointTrajectoryControllerState, f"{controller}/controller_state", 10)
         on_trajectory: Any = self._on_trajectory  # rclpy awaits coroutines; its type hints do not allow them
         node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", on_trajectory, QOS_COMMAND)
-        self._owner_topic = owner_topic(f"{controller}/follow_joint_trajectory")
+        action = f"{controller}/follow_joint_trajectory"
+        self._limit, self._fastest = node.create_publisher(Float64, fastest_topic(action), latest()), math.inf
+        self._owner_topic = owner_topic(action)
         #: Of the client of the goal that runs, if it is of this machine.
         self._lifeline: lifeline.Watched | None = None
         #: The newest goal of an owner, and how many publish there.
@@ -148,7 +152,10 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         self._arm.start(trajectory, state.t_ns, state.position, done)
 
     def publish_state(self) -> None:
-        """Publish controller_state at the end of a tick, in the thread of the loop, to its subscribers."""
+        """Publish controller_state to its subscribers, and a new speed limit, at the end of a tick of the loop."""
+        if self._arm.fastest != self._fastest:
+            self._fastest = self._arm.fastest
+            self._limit.publish(Float64(data=self._fastest))
         state = self._arm.state
         if state is None or not self._states.get_subscription_count():
             return

@@ -399,6 +399,10 @@ class _ArmController:
         self._robot, self._follower = robot, robot.simulated.controller.arms[arm]
         self.name = f"the {arm} arm's controller"
 
+    @property
+    def fastest(self) -> float:
+        return self._follower.fastest
+
     def ready(self) -> bool:
         return True
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
@@ -11,13 +12,14 @@ from typing import Any, TypeVar
 from action_msgs.msg import GoalInfo
 from control_msgs.action import FollowJointTrajectory
 from rclpy.task import Future, Task
+from std_msgs.msg import Float64
 from unique_identifier_msgs.msg import UUID
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.lifeline import Lifeline
 from openarm_common.robot.lift import LIFT
 from openarm_common.robot.robot_state import RobotStateBuffer
-from openarm_common.ros.actions import ActionClient, latest, owner_topic
+from openarm_common.ros.actions import ActionClient, fastest_topic, latest, owner_topic
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_to_msg
 from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BaseNode
@@ -121,6 +123,12 @@ class Controller:
         self._goal_id = goal_id
         self._client = ActionClient(node, FollowJointTrajectory, name)
         self._owner = node.create_publisher(GoalInfo, owner_topic(name), latest())
+        #: See `ArmController.fastest`.
+        self.fastest = math.inf
+        node.create_subscription(Float64, fastest_topic(name), self._on_fastest, latest())
+
+    def _on_fastest(self, message: Float64) -> None:
+        self.fastest = message.data if message.data > 0.0 else math.inf
 
     def ready(self) -> bool:
         """Whether its action is in the graph."""

@@ -117,7 +117,8 @@ class PlanningContext:
         """
         self._scene.require(expected)
         starts = np.split(np.asarray(start), np.cumsum([arm.kinematics.n for arm in arms])[:-1])
-        parts = [self.start(arm, part, scale, stopped) for arm, part in zip(arms, starts, strict=True)]
+        slow = self._slowed(arms, scale)
+        parts = [self.start(arm, part, slow, stopped) for arm, part in zip(arms, starts, strict=True)]
         now = replace(parts[0], start=np.concatenate([part.start for part in parts]))
         uncertain = list(estimates)
         for arm, part, boxes in zip(arms, parts, attached, strict=True):
@@ -165,6 +166,12 @@ class PlanningContext:
         """Wait a moment for a fresh joint state; see `Watch.fresh`."""
         if self._robot.state_age() > self._config.execution.stale_after:
             await Watch(self._robot).fresh()
+
+    def _slowed(self, arms: Sequence[Arm], scale: Scale) -> Scale:
+        """Velocity scale with which no joint is faster than a controller of the arms follows now."""
+        share = min(self._robot.controller(arm.name).fastest / arm.limits(1.0).velocity.max() for arm in arms)
+        scales = scale if isinstance(scale, tuple) else (scale, scale)
+        return scale if share >= 1.0 else (min(arms[0].scale(scales[0]), share), scales[1])
 
     def _reach(self) -> tuple[Array, Array]:
         """Two corners (3,) of a box about all that the arms, and what they hold, can meet; base frame, m."""

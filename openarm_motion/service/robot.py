@@ -68,6 +68,11 @@ class ArmController(Protocol):
         """For messages."""
         ...
 
+    @property
+    def fastest(self) -> float:
+        """Largest speed of a joint that it follows now, rad/s; infinite where the limits of the joints are all."""
+        ...
+
     def ready(self) -> bool:
         """Whether it is there."""
         ...

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
+from openarm_common.ros.actions import latest
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.node import QOS_COMMAND
 from openarm_hardware.ros.node import OpenArmHardware
@@ -118,12 +120,21 @@ def test_a_motor_s_fault_is_reported_by_name_refuses_goals_and_is_reset_when_it_
 @pytest.mark.requirement("R-08")
 def test_a_motor_that_lost_a_turn_is_said_and_its_joint_is_where_it_is(bench: Bench) -> None:
     before = bench.arm
+    limits = bench.collect(Float64, "/right_joint_trajectory_controller/fastest", latest())
     bench.inject("motor_fault", f"{{kind: turn, joint: {bench.ARM[0]}, value: 1}}")
     bench.ros.spin_until(lambda: bench.report().get("right_phase") == "DAMPED", what="the reading jumps")
     bench.call(Trigger, "/openarm_hardware/reset")
     bench.ros.spin_until(lambda: "(a turn) was added" in bench.report().get(bench.ARM[0], ""), what="the turn is said")
     bench.ros.spin_until(lambda: bench.level() == b"\0", what="the arms are up again")
     assert bench.arm == pytest.approx(before, abs=0.4)  # it sank until it was reset
+    bench.ros.spin_until(lambda: bool(limits), what="the limit of the first motion")
+    assert limits[-1].data == pytest.approx(0.3)
+    up = [q + 0.2 * (i == 1) for i, q in enumerate(bench.arm)]
+    _, result = bench.follow(bench.goal((0.5, up)))
+    assert "its limit is 0.30 until this arm has arrived once" in bench.ros.result(result).result.error_string
+    _, result = bench.follow(bench.goal((1.0, up)))
+    assert bench.ros.result(result).result.error_code == 0
+    bench.ros.spin_until(lambda: limits[-1].data == float("inf"), what="the end of the limit")
     kept = json.loads((Path(bench.hardware.config.calibrations) / "last_posture_emulated.json").read_text())
     assert kept["positions"][bench.ARM[0]] == pytest.approx(before[0], abs=0.4)
 

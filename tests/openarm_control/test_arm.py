@@ -110,6 +110,27 @@ def test_a_first_point_that_cannot_be_reached_in_time_is_refused() -> None:
     assert isinstance(error, TrajectoryError)
 
 
+def test_after_a_lost_turn_the_first_motion_is_slow_and_a_fast_one_refused_with_why(arm: Arm) -> None:
+    arm.follower.careful = "a motor lost a turn"
+    limit = (
+        r"0\.50 rad/s between point 0 and the next, its limit is 0\.30 until this arm has arrived once: a motor lost"
+    )
+    refused(limit, arm.start)
+    arm.follower.set_target(np.array([0.3, 0.0]))
+    arm.tick(200)
+    assert np.diff(np.array(arm.history), axis=0).max() <= 0.3 * 0.01 + 1e-9
+    np.testing.assert_allclose(arm.q, [0.3, 0.0])
+    arm.start(t=np.array([2.0]))
+    arm.follower.cancel()
+    assert arm.run().end is End.CANCELLED
+    refused("until this arm has arrived once", arm.start, t=np.array([0.8]))
+    arm.start(t=np.array([2.0]))
+    assert arm.run().end is End.SUCCEEDED
+    assert arm.follower.fastest == np.inf
+    arm.start(q=np.zeros((1, 2)))
+    assert arm.run().end is End.SUCCEEDED
+
+
 def test_a_joint_without_end_is_commanded_on_from_where_it_is_whatever_turn_is_asked_for() -> None:
     far = np.array([np.inf, 2.0])
     arm = Arm(group=JointGroup(GROUP.names, -far, far, GROUP.max_velocity))

@@ -55,6 +55,16 @@ class Finger:
             self.t_ns += 10 * MS
 
 
+def test_after_a_lost_turn_the_first_motion_of_a_hand_is_slow() -> None:
+    finger = Finger()
+    finger.follower.careful = "a motor lost a turn"
+    for position, fastest in ((0.035, 0.0075), (0.0, 0.075)):
+        finger.targets.clear()
+        finger.start(position)
+        assert finger.run().reached_goal
+        assert np.abs(np.diff(finger.targets)).max() == pytest.approx(fastest * 0.01)
+
+
 @pytest.mark.parametrize("position", [0.005, 0.035, 0.025, 0.0, 0.044])
 @pytest.mark.requirement("P-22")
 def test_the_finger_reaches_its_goal(position: float) -> None:

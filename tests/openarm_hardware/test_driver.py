@@ -47,12 +47,13 @@ class Servo:
         self.commanded = self.q + 0.01
         self.phases: tuple[int, ...] = FOLLOWS
         self.text = ""
+        self.turns = np.zeros(len(self.axes))
         self.cycles = 0
 
     def state(self) -> State:
         self.cycles += 1
-        rows = zip(self.q.tolist(), self.commanded.tolist(), strict=True)
-        motors = tuple(MotorState(q, 0.1, 0.5, c, 0.2, 1, 40, 41, 0) for q, c in rows)
+        rows = zip(self.q.tolist(), self.commanded.tolist(), self.turns.tolist(), strict=True)
+        motors = tuple(MotorState(q, 0.1, 0.5, c, 0.2, 1, 40, 41, 0, turn) for q, c, turn in rows)
         return State(time.monotonic_ns(), self.cycles, 0, self.phases, 0, self.text, motors)
 
     def command(self, joints: list[tuple[float, float]]) -> None:
@@ -212,6 +213,27 @@ def test_arms_that_do_not_follow_are_told_to_stay(bench: Bench) -> None:
     assert command[8:] == pytest.approx(servo.commanded[8:])
     servo.alive = False
     assert "process that commands the motors has ended" in bench.driver.fault()
+
+
+def test_the_first_motion_of_what_lost_a_turn_is_slow_each_time_that_the_arm_comes_up(bench: Bench) -> None:
+    servo, controller = bench.servo, bench.controller
+    (first, second), hands = controller.arms.values(), controller.grippers.values()
+
+    def careful() -> list[bool]:
+        bench.driver.take()
+        return [bool(follower.careful) for follower in (first, second, *hands)]
+
+    servo.turns[[2, 15]] = np.array([2.0, -2.0]) * np.pi  # a joint of the first arm, the hand of the second
+    for phase in (Phase.LOOKING, Phase.REFUSED, Phase.FOLLOWING, Phase.HELD):
+        servo.phases = (phase, phase)
+        assert not any(careful())
+    servo.phases = (Phase.ENABLING, Phase.LOOKING)
+    assert careful() == [True, False, False, False]
+    servo.phases = (Phase.FOLLOWING, Phase.RAMPING)
+    assert careful() == [True, False, False, True]
+    first.careful = ""
+    servo.phases = FOLLOWS
+    assert careful() == [False, False, False, True]
 
 
 def test_the_emergency_stop_and_its_reset_are_those_of_the_motors(bench: Bench) -> None:

@@ -65,6 +65,7 @@ class Controller:
         self.robot, self.name = robot, name
         self.goals: list[Goal] = []
         self.there = True
+        self.fastest = math.inf
 
     def ready(self) -> bool:
         return self.there
@@ -225,6 +226,30 @@ def test_a_wrist_that_turns_without_end_goes_the_short_way_from_any_turn(descrip
     solved = bench.service.compute_ik("right", pose, (), position_only=False).nearest
     assert solved.success
     assert abs(solved.q[6] - bench.robot.state[name]) < 0.1
+
+
+def test_plans_keep_the_speed_that_the_controller_of_an_arm_follows_now(bench) -> None:
+    """An arm whose motor lost a turn; a motion of both keeps it, too, and a request that is slower anyway."""
+
+    def fastest(*trajectories) -> float:
+        return max(float(np.abs(one.v).max()) for one in trajectories)
+
+    right = bench.robot.controllers["right"]
+    right.fastest = 0.3
+    (slow,) = bench.run(bench.move(plan_only=True))
+    assert 0.15 < fastest(slow.trajectory) <= 0.3 * 1.001
+    (other,) = bench.run(bench.move("left", plan_only=True))
+    assert fastest(other.trajectory) > 1.0
+    targets = (ArmGoal("left", NamedGoal("official_home")), ArmGoal("right", NamedGoal("official_home")))
+    (both,) = bench.run(bench.service.move_arms(MoveArmsRequest(targets, scale=1.0, plan_only=True)))
+    assert fastest(*both.plan.trajectories) <= 0.3 * 1.001
+    (slower,) = bench.run(
+        bench.service.move(MoveRequest("right", NamedGoal("official_home"), scale=0.02, plan_only=True))
+    )
+    assert fastest(slower.trajectory) < 0.07
+    right.fastest = math.inf
+    (again,) = bench.run(bench.move(plan_only=True))
+    assert again.trajectory.duration < 0.5 * slow.trajectory.duration
 
 
 def test_plan_only_sends_nothing_and_the_plan_is_executed_later(bench) -> None:
