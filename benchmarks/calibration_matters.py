@@ -30,7 +30,7 @@ from openarm_common.resources import models_dir
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.campaign.mounts import with_mounts
 from openarm_evaluation.campaign.options import parse_seeds
-from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.robot import Known, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
@@ -76,7 +76,7 @@ def compare(scene: str, label: str, seed: int, mounts: Mounts) -> tuple[dict[str
     task = Task("matters", 0, load_scene(scene), (label,), mount_seed=seed)
     # the detector would notice most of these mounts by the table, and refuse
     senses = SimulatedSenses(depth_noise=False, sets=("detector.watch.enabled=false",))
-    nominal, calibrated = (Trials(task, senses, GraspConfig(), used).run() for used in ({}, mounts))
+    nominal, calibrated = (Trials(task, senses, GraspConfig(), Known(used)).run() for used in ({}, mounts))
     camera = load_cameras()[CAMERAS[0]]
     true = true_mount(camera, seed)
     away = [mount_error(T, true)[0] * 1e3 for T in (camera.T_parent_link, mounts[CAMERAS[0]])]

@@ -38,7 +38,7 @@ from openarm_common.scene.scene import random_scene
 from openarm_common.types import Array
 from openarm_evaluation.campaign.mounts import Bench
 from openarm_evaluation.campaign.parameters import suite_config
-from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.robot import Known, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_sim_bridge.world.hardware import HardwareConfig, drawn
@@ -129,7 +129,7 @@ def place(seed: int, arm: str, mounts: Mapping[str, Array]) -> tuple[bool, float
     scenes = (random_scene(1000 * seed + k, count=1) for k in range(1000))
     scene = next(one for one in scenes if side * one.objects[0].position[1] > 0.04 * abs(side))
     task = Task("zeros", seed, scene, (scene.objects[0].label,), arm=arm, mount_seed=seed, dynamics_seed=seed)
-    row = Trials(task, SimulatedSenses(sets=SETS), suite_config(SETS).grasp, mounts=mounts).run()
+    row = Trials(task, SimulatedSenses(sets=SETS), suite_config(SETS).grasp, Known(mounts)).run()
     error = row["place_error_mm"]
     print(f"seed {seed:2d} {arm:5s} {row['outcome']}, attempts {row['attempts']}, {error} mm {row['code']}", flush=True)
     return row["placed"] and row["attempts"] == 1, math.nan if error is None else error * 1e-3

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import coroutine
 from typing import TypeVar
@@ -113,6 +114,25 @@ async def together(parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
         raise faults[0]
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What the suite has found of a robot; the rest is as configured and described.
+
+    Args:
+        mounts: T_parent_link (4, 4) by camera.
+        servos: Servos of the arms as identified, by side; None: as the profile says.
+        hands: As they were learned, by arm.
+    """
+
+    mounts: Mapping[str, Array] = field(default_factory=dict[str, Array])
+    servos: Mapping[str, ServoModel] | None = None
+    hands: Mapping[str, HandReach] = field(default_factory=dict[str, HandReach])
+
+
+#: Nothing was found.
+UNKNOWN = Known()
+
+
 class SimRobot:
     """One world and all that moves and watches it. One thread.
 
@@ -120,11 +140,9 @@ class SimRobot:
         scene: What is on the table.
         senses: How well it sees.
         mount_seed: Seed of the true camera mounts; None mounts them where the configuration says.
-        mounts: T_parent_link by camera as the suite believes; those left out are nominal.
         dynamics_seed: Seed of motors, masses and joint zeros; None: that of the configuration.
         hand_seed: Seed of stops and friction of the fingers; None: that of the configuration.
-        hands: As they were learned, by arm; the drawing stands for those left out.
-        servos: Servos of the arms as identified, by side; None: as the profile says.
+        known: What the suite has found of it.
         table: As the suite believes; None: as it is.
         seed: Seed of the noise.
         posture: Joints that start elsewhere than at home, rad by name.
@@ -136,17 +154,15 @@ class SimRobot:
         senses: SimulatedSenses,
         *,
         mount_seed: int | None = None,
-        mounts: Mapping[str, Array] | None = None,
         dynamics_seed: int | None = None,
         hand_seed: int | None = None,
-        hands: Mapping[str, HandReach] | None = None,
-        servos: Mapping[str, ServoModel] | None = None,
+        known: Known = UNKNOWN,
         table: Table | None = None,
         seed: int = 0,
         posture: Mapping[str, float] | None = None,
     ) -> None:
         self.scene = scene
-        self.description = RobotDescription.load().with_hands(hands or {})
+        self.description = RobotDescription.load().with_hands(known.hands)
         self.cameras = load_cameras()
         self._latency_s, self._sets = senses.latency, senses.parameters()
         self.suite = suite = suite_config(self._sets)
@@ -154,7 +170,7 @@ class SimRobot:
         stage = Stage(self.description, self.cameras, mount_seed, suite.bridge.physics, hardware)
         stage.home |= posture or {}
         bridge = suite.bridge
-        self.simulated = SimulatedRobot.on(stage, scene, bridge.trajectory, bridge.gripper, servos)
+        self.simulated = SimulatedRobot.on(stage, scene, bridge.trajectory, bridge.gripper, known.servos)
         self.world = self.simulated.world
         self.world_faults = self.simulated.faults
         self._rng = np.random.default_rng([seed, 77])
@@ -167,7 +183,7 @@ class SimRobot:
         self.trace: deque[tuple[int, Array, Array]] = deque(maxlen=int(_TRACE_S * 1e9) // self.world.period_ns)
         self.images: dict[str, tuple[int, NDArray[np.uint8], DepthImage]] = {}
         #: The cameras where the suite believes that they are mounted.
-        self.mounted = mounted(self.cameras, mounts or {})
+        self.mounted = mounted(self.cameras, known.mounts)
         self._arriving: deque[tuple[int, Frame]] = deque()
         self.frames: deque[Frame] = deque(maxlen=64)
         #: What the hands hold, as the planner believes; the detector takes it for a part of the robot.
@@ -181,7 +197,7 @@ class SimRobot:
         self.planning_s: list[float] = []
         self.map = SimulatedMap(self.description, suite.octomap, self.mounted)
         self._controllers = {arm: _ArmController(self, arm) for arm in self.simulated.controller.arms}
-        arms = arms_behind(self._sets, self.table, tuple(self.mounted.values()), tuple((hands or {}).items()))
+        arms = arms_behind(self._sets, self.table, tuple(self.mounted.values()), tuple(known.hands.items()))
         self.motion = MotionService(self, suite.motion, arms, self.map, (self.description.root,))
         self.motion.on_held = self._take_held
         self._note()

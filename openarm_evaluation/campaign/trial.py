@@ -16,7 +16,6 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.servos import ServoModel
-from openarm_common.robot.zeros import HandReach
 from openarm_common.types import Array
 from openarm_evaluation.campaign import record
 from openarm_evaluation.campaign.dynamics import with_servos
@@ -25,7 +24,7 @@ from openarm_evaluation.campaign.in_process_robot import InProcessRobot
 from openarm_evaluation.campaign.mounts import with_mounts
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.parameters import suite_config
-from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
+from openarm_evaluation.campaign.robot import UNKNOWN, Known, SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, watch_clearance
@@ -57,9 +56,7 @@ class Trials:
         task: What is asked.
         senses: How well the robot sees.
         config: Parameters of the grasp.
-        mounts: T_parent_link by camera as the suite believes.
-        servos: Servos of the arms as identified, by side; None: as the profile says.
-        hands: As they were learned, by arm.
+        known: What the suite has found of the robot.
         folder: Gets what is kept of a failure.
         again: The command that runs this task again, for the report.
     """
@@ -69,9 +66,7 @@ class Trials:
         task: Task,
         senses: SimulatedSenses,
         config: GraspConfig,
-        mounts: Mapping[str, Array] | None = None,
-        servos: Mapping[str, ServoModel] | None = None,
-        hands: Mapping[str, HandReach] | None = None,
+        known: Known = UNKNOWN,
         folder: Path | None = None,
         again: str = "",
     ) -> None:
@@ -83,11 +78,9 @@ class Trials:
             task.scene,
             senses,
             mount_seed=task.mount_seed,
-            mounts=mounts,
             dynamics_seed=task.dynamics_seed,
             hand_seed=task.hand_seed,
-            hands=hands,
-            servos=servos,
+            known=known,
             seed=task.seed,
             posture=task.posture,
         )
@@ -264,10 +257,8 @@ class Trials:
                 return
 
 
-def with_robot(
-    task: Task, options: CampaignOptions, folder: Path
-) -> tuple[Task, Mapping[str, Array], Mapping[str, ServoModel] | None, Mapping[str, HandReach]]:
-    """The task with the robot of its seed: mounts by camera, servos and hands by side, as the suite has found them.
+def with_robot(task: Task, options: CampaignOptions, folder: Path) -> tuple[Task, Known]:
+    """The task with the robot of its seed, and what the suite has found of that.
 
     Args:
         task: The task.
@@ -282,21 +273,19 @@ def with_robot(
         hardware = suite_config(options.graph_parameters()).bridge.hardware.of_seed(task.dynamics_seed)
         task, mounts = with_mounts(task, options.mount_seeds, folder / "mounts", hardware)
     task, hands = with_hands(task, options, folder)
-    return task, mounts, servos, hands
+    return task, Known(mounts, servos, hands)
 
 
 def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
     """Run one task in this process and return its row, whatever happens."""
     task, sets = make_task(options.set_name, seed, options.objects), options.graph_parameters()
     try:
-        task, mounts, servos, hands = with_robot(task, options, folder)
+        task, known = with_robot(task, options, folder)
         trials = Trials(
             task,
             SimulatedSenses(sets=sets),
             suite_config(sets).grasp,
-            mounts=mounts,
-            servos=servos,
-            hands=hands,
+            known,
             folder=folder / "failures" / str(seed),
             again=options.command(seed),
         )

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.calibration_matters import shipped_mounts
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.campaign.parameters import suite_config
-from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.robot import Known, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 
@@ -25,7 +25,7 @@ def grasp(*sets: str, calibrated: bool = True) -> tuple[dict[str, Any], float]:
         sets = (*sets, "detector.watch.enabled=false")
     senses = SimulatedSenses(depth_noise=False, sets=("grasp.limits.max_attempts=1", *sets))
     mounts = shipped_mounts() if calibrated else {}
-    run = Trials(task, senses, suite_config(senses.parameters()).grasp, mounts=mounts)
+    run = Trials(task, senses, suite_config(senses.parameters()).grasp, Known(mounts))
     row, screen = run.run(), run.robot.tracks["screen"]
     return row, max(float(np.linalg.norm(sample.p_world - screen[0].p_world)) for sample in screen)
 

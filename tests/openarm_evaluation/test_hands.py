@@ -13,7 +13,7 @@ from openarm_common.scene.scene import Scene, SceneObject
 from openarm_evaluation.campaign.hands import with_hands
 from openarm_evaluation.campaign.options import CampaignOptions
 from openarm_evaluation.campaign.parameters import suite_config
-from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.robot import UNKNOWN, Known, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_sim_bridge.world.hardware import drawn
@@ -41,17 +41,17 @@ def test_a_hand_with_stops_of_its_own_is_refused_until_it_is_learned_and_then_wo
         assert reach.opened == pytest.approx(true[arm].opened, abs=1e-3)
     assert with_hands(task(0.05), options, tmp_path)[1] == hands
 
-    def row(task: Task, **known: object) -> dict[str, object]:
-        return Trials(task, SimulatedSenses(sets=sets), config.grasp, **known).run()  # type: ignore[arg-type]
+    def row(task: Task, known: Known = UNKNOWN) -> dict[str, object]:
+        return Trials(task, SimulatedSenses(sets=sets), config.grasp, known).run()
 
     before = row(asked)
     assert before["code"] in (Code.NOT_READY, Code.EXECUTION_FAILED)
     assert "openarm hardware learn-hand" in str(before["message"])
-    after = row(asked, hands=hands)
+    after = row(asked, Known(hands=hands))
     assert after["placed"], after["message"]
     wide, _ = with_hands(task(0.076), options, tmp_path)
     assert wide.codes == (Code.OK, Code.TOO_WIDE)
-    refused = row(wide, hands=hands)
+    refused = row(wide, Known(hands=hands))
     widest = 2e3 * (hands["left"].opened - 0.005)
     assert (refused["code"], refused["as_expected"]) == (Code.TOO_WIDE, True)
     assert f"the hand grasps sides up to {widest:.0f} mm" in str(refused["message"])

@@ -10,7 +10,7 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
-from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.robot import Known, SimulatedSenses
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import DriftConfig, GraspConfig
@@ -97,7 +97,7 @@ def test_grasps_with_a_mount_8_mm_off_raise_the_alarm() -> None:
     believed = se3.make(p=(0.006, 0.0053, 0.0)) @ camera.T_parent_link
     task = replace(make_task("nominal", 10001), labels=("red", "green") * 3)
     senses = SimulatedSenses(depth_noise=False, sets=("mujoco_bridge.profile=ideal",))  # the hand knows where it is
-    trials = Trials(task, senses, GraspConfig(), mounts={"overhead": believed})
+    trials = Trials(task, senses, GraspConfig(), Known({"overhead": believed}))
     row = trials.run()
     assert row["placed"], row["message"]
     drift = trials.session.drift.drift()

@@ -12,7 +12,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, SceneObject
-from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.robot import Known, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
@@ -33,7 +33,7 @@ def grasp(*, enabled: bool, off: tuple[float, float]) -> tuple[Trials, dict, flo
     task = Task("nominal", 1, Scene(name="near", objects=(CUBE,)), ("red",))
     mounts = {"overhead": se3.make(p=(*off, 0.0)) @ camera.T_parent_link}
     senses = SimulatedSenses(depth_noise=False, sets=("mujoco_bridge.profile=ideal",))  # the hand knows where it is
-    trials = Trials(task, senses, config, mounts=mounts)
+    trials = Trials(task, senses, config, Known(mounts))
     errors: list[float] = []
     report = trials._report
 
