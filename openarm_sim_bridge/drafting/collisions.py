@@ -53,6 +53,16 @@ class LinkContacts:
                 owner.append(link.name)
         self._geometry.addAllCollisionPairs()
         self._pairs = [frozenset((owner[p.first], owner[p.second])) for p in self._geometry.collisionPairs]
+        ends = np.array([(p.first, p.second) for p in self._geometry.collisionPairs], np.int64).reshape(-1, 2)
+        self._first, self._second = ends.T
+        shapes = [item.geometry for item in self._geometry.geometryObjects]
+        for shape in shapes:
+            shape.computeLocalAABB()
+        #: Of a ball around each shape: its centre in the frame of the shape.
+        self._centres = [shape.aabb_center for shape in shapes]
+        radii = np.array([shape.aabb_radius for shape in shapes])
+        #: Shapes of a pair with centres that are further apart do not touch.
+        self._apart = radii[self._first] + radii[self._second] + margin
         self._data, self._placed = self._model.createData(), self._geometry.createData()
         for request in self._placed.collisionRequests:
             request.security_margin = margin
@@ -63,47 +73,29 @@ class LinkContacts:
 
     def touching(self, samples: int, seed: int) -> set[Pair]:
         """Return the pairs of links that touch in at least one random state."""
-        left = self._by_links()
-        found: set[Pair] = set()
+        left, found = set(self._pairs), set[Pair]()
         rng = np.random.default_rng(seed)
         for _ in range(samples):
-            for pair in self._hits(self._random(rng), left):
-                found.add(pair)
-                for k in left.pop(pair):
-                    self._placed.deactivateCollisionPair(k)
-        self._activate()
+            hits = self._hits(self._random(rng), left)
+            found |= hits
+            left -= hits
         return found
 
     def always_touching(self, samples: int = _ALWAYS, seed: int = 0) -> set[Pair]:
         """Return the pairs of links that touch in every random state."""
-        left = self._by_links()
-        rng = np.random.default_rng(seed)
+        left, rng = set(self._pairs), np.random.default_rng(seed)
         for _ in range(samples):
-            hits = self._hits(self._random(rng), left)
-            for pair in set(left) - hits:
-                for k in left.pop(pair):
-                    self._placed.deactivateCollisionPair(k)
+            left = self._hits(self._random(rng), left)
             if not left:
                 break
-        self._activate()
-        return set(left)
+        return left
 
     def at(self, state: Mapping[str, float]) -> set[Pair]:
         """Return the pairs of links that touch in a state; joints that it does not name are at 0, followers follow."""
         q: Array = np.array(pin.neutral(self._model))
         for name, value in state.items():
             self._put(q, name, value)
-        return self._hits(self._followed(q), self._by_links())
-
-    def _activate(self) -> None:
-        for k in range(len(self._pairs)):
-            self._placed.activateCollisionPair(k)
-
-    def _by_links(self) -> dict[Pair, list[int]]:
-        found: dict[Pair, list[int]] = {}
-        for k, pair in enumerate(self._pairs):
-            found.setdefault(pair, []).append(k)
-        return found
+        return self._hits(self._followed(q), set(self._pairs))
 
     def _random(self, rng: np.random.Generator) -> Array:
         q = rng.uniform(self._model.lowerPositionLimit, self._model.upperPositionLimit)
@@ -123,11 +115,17 @@ class LinkContacts:
             q[self._columns[joint.name]] = joint.multiplier * q[self._columns[str(joint.mimic)]] + joint.offset
         return q
 
-    def _hits(self, q: Array, among: Mapping[Pair, list[int]]) -> set[Pair]:
-        if not pin.computeCollisions(self._model, self._data, self._geometry, self._placed, q, False):
-            return set()
-        results = self._placed.collisionResults
-        return {pair for pair, ks in among.items() if any(results[k].isCollision() for k in ks)}
+    def _hits(self, q: Array, among: set[Pair]) -> set[Pair]:
+        pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._placed, q)
+        placed = zip(self._placed.oMg, self._centres, strict=True)
+        centres = np.array([T.act(centre) for T, centre in placed]).reshape(-1, 3)
+        away = centres[self._first] - centres[self._second]
+        found = set[Pair]()
+        for k in np.flatnonzero(np.einsum("ij,ij->i", away, away) <= self._apart**2).tolist():
+            pair = self._pairs[k]
+            if pair in among and pair not in found and pin.computeCollision(self._geometry, self._placed, k):
+                found.add(pair)
+        return found
 
 
 def coal_shape(shape: Primitive) -> coal.CollisionGeometry:
