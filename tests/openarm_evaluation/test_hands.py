@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, SceneObject
-from openarm_evaluation.campaign.hands import with_hands
+from openarm_evaluation.campaign.hands import with_drawn_hands, with_hands
 from openarm_evaluation.campaign.options import CampaignOptions
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.robot import UNKNOWN, Known, SimulatedSenses
@@ -25,6 +26,16 @@ SEED = 4
 def task(width: float) -> Task:
     box = SceneObject(name="box", shape="box", size=(width, width, 0.07), color="red", position=(0.26, 0.22))
     return Task("nominal", 0, Scene(name="bench", objects=(box,)), ("red",))
+
+
+def test_a_task_has_the_hands_of_its_turn_and_may_be_refused_what_they_cannot_take() -> None:
+    options = CampaignOptions(hand_seeds=(SEED, 9), profile="ideal")
+    for width, codes in ((0.05, (Code.OK,)), (0.076, (Code.OK, Code.TOO_WIDE))):
+        found = with_drawn_hands(task(width), options)
+        assert (found.hand_seed, found.codes) == (SEED, codes)
+    assert with_drawn_hands(replace(task(0.05), seed=1), options).hand_seed == 9
+    described = task(0.076)
+    assert with_drawn_hands(described, CampaignOptions(profile="ideal")) is described
 
 
 @pytest.mark.long

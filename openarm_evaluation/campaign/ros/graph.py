@@ -20,6 +20,7 @@ from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_evaluation.campaign.dynamics import with_servos
+from openarm_evaluation.campaign.hands import with_drawn_hands
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.record import write_reason
 from openarm_evaluation.campaign.tasks.suites import make_task
@@ -87,7 +88,8 @@ async def _run(options: CampaignOptions, seeds: Sequence[int], folder: Path, kee
                 for seed in seeds:
                     if options.emulated:
                         bring_home(client)
-                    row = _row(observer, client, make_task(options.set_name, seed, options.objects), folder / "scenes")
+                    task = with_drawn_hands(make_task(options.set_name, seed, options.objects), options)
+                    row = _row(observer, client, task, folder / "scenes")
                     row = {**row, "again": f"{options.command(seed)} --graph"}
                     if not row["as_expected"]:
                         keep_recording(client, row, folder / "failures" / str(seed))
