@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import itertools
 import xml.etree.ElementTree as ET
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from openarm_common.errors import OpenArmError
@@ -67,6 +69,15 @@ def test_no_pair_that_is_said_never_to_touch_does(robot):
     assert len(never) > (50 if len(robot.arms) == 2 else 20)
     assert len(touching) > (30 if len(robot.arms) == 2 else 15)
     assert not never & touching
+
+
+def test_leaving_out_shapes_that_are_far_apart_changes_nothing(robot):
+    contacts, rng = LinkContacts(robot, 0.01), np.random.default_rng(3)
+    for _ in range(20):
+        q = contacts._random(rng)
+        pin.computeCollisions(contacts._model, contacts._data, contacts._geometry, contacts._placed, q, False)
+        hits = [result.isCollision() for result in contacts._placed.collisionResults]
+        assert contacts._hits(q, set(contacts._pairs)) == set(itertools.compress(contacts._pairs, hits))
 
 
 @pytest.fixture
