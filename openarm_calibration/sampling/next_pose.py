@@ -30,6 +30,7 @@ from openarm_calibration.sampling.bodies import Bodies, chain_poses
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.collision.self_collision import SelfCollision
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
@@ -164,6 +165,7 @@ class PoseSearch:
         self._config = config or SearchConfig()
         self._rng = np.random.default_rng(self._config.seed)
         self._bodies = Bodies(description)
+        self._contact = SelfCollision(description, tuple(description.joints))
         work = load_folder(robot_name())[1].work
         self._table = None if work is None else work.table
         self._known: list[Array] = []
@@ -281,10 +283,11 @@ class PoseSearch:
                 q, T = drawn[k], views[k]
                 if not visible(samples.board, T, samples.head.optics, margin):
                     continue
-                links = self._description.link_poses({**state, **_joints(samples, q)})
-                shapes = self._bodies.place(links)
-                if self._bodies.touching(shapes) or self._sinks(samples, links, Z, plate):
+                posture = {**state, **_joints(samples, q)}
+                links = self._description.link_poses(posture)
+                if self._touches(posture) or self._sinks(samples, links, Z, plate):
                     continue
+                shapes = self._bodies.place(links)
                 eye = links[samples.head.parent] @ self.belief.X
                 if self._bodies.hidden(shapes, eye[:3, 3], se3.apply(eye @ T, plate)):
                     shadowed += 1
@@ -294,6 +297,10 @@ class PoseSearch:
                 if len(out) == wanted:
                     break
         return out, shadowed
+
+    def _touches(self, posture: Mapping[str, float]) -> bool:
+        distances = self._contact.distances(np.array([posture[name] for name in self._description.joints]))
+        return self._contact.nearest(distances).distance <= 0.0
 
     def _sinks(self, samples: SampleSet, links: Mapping[str, Array], Z: Array, plate: Array) -> bool:
         """Return whether a board in the hand, of points (n, 3), is too near to the table."""

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.description import Primitive, RobotDescription
 from openarm_common.robot.folder import robot_work
 from openarm_common.scene.scene import load_scene
 from tests.refusals import refuses
@@ -118,6 +120,20 @@ def test_what_was_refused_is_not_proposed_again() -> None:
         search.refuse(proposal)
     again = search.propose(arm.samples, arm.state)
     assert all(np.abs(a - b).max() > 0.05 for a in again for b in first)
+
+
+def test_hulls_that_lie_in_one_box_without_touching_are_in_nobody_s_way() -> None:
+    """Links of grippers with knuckles: of two hulls the boxes overlap in every posture."""
+    arm = Arm("overhead")
+    corners = np.array([[x, y, z] for x, y in ((-1.0, -1.0), (1.0, -1.0), (-1.0, 0.5)) for z in (-1.0, 1.0)]) * 0.03
+    links = dict(arm.description.links)
+    tool = arm.description.link_pose("openarm_left_hand_tcp", arm.state)
+    for link, side in (("openarm_left_left_finger", 1.0), ("openarm_left_hand_tcp", -1.0)):
+        beside = se3.inverse(arm.description.link_pose(link, arm.state)) @ tool @ se3.make(None, (0.0, 0.3, 0.0))
+        hull = Primitive("hull", "box", (0.06, 0.06, 0.06), beside, corners=side * corners)
+        links[link] = replace(links[link], collision=(*links[link].collision, hull))
+    arm.description = replace(arm.description, links=MappingProxyType(links))
+    assert arm.search().propose(arm.samples, arm.state)
 
 
 def test_a_board_in_the_hand_is_not_sent_close_to_the_table() -> None:
