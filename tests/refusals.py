@@ -15,11 +15,9 @@ P = ParamSpec("P")
 
 
 @contextmanager
-def refuses(
-    code: Code, match: str | None = None, error: type[OpenArmError] = OpenArmError
-) -> Iterator[pytest.ExceptionInfo[OpenArmError]]:
+def refuses(code: Code, match: str | None = None) -> Iterator[pytest.ExceptionInfo[OpenArmError]]:
     """Expect an error with this code, in whose text the pattern is found."""
-    with pytest.raises(error, match=match) as caught:
+    with pytest.raises(OpenArmError, match=match) as caught:
         yield caught
     assert caught.value.code is code, caught.value
 
