@@ -22,6 +22,8 @@ from openarm_common.robot.xml_text import floats
 from openarm_common.types import Array
 
 _PACKAGE, _FILE = "package://", "file://"
+#: First words of the file that Git LFS has in place of one that it has not brought.
+_LFS = b"version https://git-lfs"
 #: How far corners of a convex mesh may be outside the plane of a triangle, and how low a triangle may be that says
 #: nothing about its plane: shares of the mesh's diagonal.
 _FLAT, _SLIVER = 1e-4, 1e-3
@@ -47,7 +49,7 @@ def mesh_file(name: str, urdf: Path, packages: Mapping[str, Path] | None = None)
     if not name.startswith(_PACKAGE):
         path = urdf.parent / name.removeprefix(_FILE)
         if is_file(path):
-            return path
+            return _whole(path)
         _, _, rest = name.partition("/share/")
         if "/" not in rest:
             way = "name it from the folder of this file, or by package://NAME/PATH"
@@ -55,15 +57,24 @@ def mesh_file(name: str, urdf: Path, packages: Mapping[str, Path] | None = None)
     else:
         rest = name.removeprefix(_PACKAGE)
     package, _, rest = rest.partition("/")
-    tried = [folder / rest.lstrip("/") for folder in package_folders(package, urdf, packages or {})]
+    folders = list(package_folders(package, urdf, packages or {}))
+    tried = [folder / rest.lstrip("/") for folder in folders]
     for path in tried:
         if is_file(path):
-            return path
+            return _whole(path)
     places = ", ".join(map(str, dict.fromkeys(tried)))
-    raise OpenArmError(
-        Code.CONFIG_INVALID,
-        f"{urdf}: there is no mesh {name!r}; tried {places}; {package_advice(package)}",
-    )
+    here = next((f"{folder} lacks it: get the file there, or " for folder in folders if folder.is_dir()), "")
+    text = f"{urdf}: there is no mesh {name!r}; tried {places}; {here}{package_advice(package)}"
+    raise OpenArmError(Code.CONFIG_INVALID, text)
+
+
+def _whole(path: Path) -> Path:
+    """Return a file that is there, and not only what Git LFS has in its place."""
+    with path.open("rb") as file:
+        if file.read(len(_LFS)) == _LFS:
+            text = f"there is no mesh {path}, but what Git LFS has in its place; `git lfs pull` in its folder brings it"
+            raise OpenArmError(Code.CONFIG_INVALID, text)
+    return path
 
 
 def package_advice(package: str) -> str:

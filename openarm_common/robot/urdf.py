@@ -230,7 +230,7 @@ def _joint(element: ET.Element) -> Joint:
     kind = attribute(element, "type")
     if kind not in get_args(JointType):
         known = f"joint {name!r} has type {kind!r}; supported: {', '.join(get_args(JointType))}"
-        why = '; arms stand on a base that does not move: write type="fixed", or leave out joint and parent link'
+        why = '; arms stand on a base that does not move: write type="fixed", or `fixed: [JOINT]` in --edits of a draft'
         raise fault(known + why * (kind in ("planar", "floating")))
     axis_element, limit, mimic = element.find("axis"), element.find("limit"), element.find("mimic")
     if kind == "fixed":  # neither says anything about a joint that does not move

@@ -29,7 +29,12 @@ _MARGIN = 0.02
 #: Largest region, which a camera over the table sees, m: along x, and |y|; least |y| of robots with two arms.
 _LONG, _WIDE, _ASIDE = 0.36, 0.42, 0.06
 #: Of postures: hands over the table, m; so far from the shoulder along x when at home, and leans then, rad.
-_OVER, _HEIGHTS, _AHEAD, _LEANS = 0.22, (0.30, 0.40, 0.50, 0.65), (0.0, 0.1, 0.2, 0.3, 0.4), (0.0, 0.8, 1.6)
+_OVER, _HEIGHTS, _AHEAD, _LEANS = (
+    (0.22, 0.17, 0.12),
+    (0.30, 0.40, 0.50, 0.65),
+    (0.0, 0.1, 0.2, 0.3, 0.4),
+    (0.0, 0.8, 1.6),
+)
 #: What hides this much around the region hides it, m.
 _AROUND = 0.06
 
@@ -116,8 +121,13 @@ def postures(
     for arm in arms.values():
         scene = arm.scene(state, gripper=arm.opened)
         side = float(np.sum(_sides(arm, arms)))
-        middle = np.array([sum(region.x) / 2.0, side * sum(region.abs_y) / 2.0, table.top_z + _OVER])
-        over = _free(arm, scene, (se3.make(_down(yaw, 0.0), middle) for yaw in _YAWS))
+        middle = (sum(region.x) / 2.0, side * sum(region.abs_y) / 2.0)
+        ways = ((up, tilts) for up in _OVER for tilts in (_TILTS[:1], _TILTS[1:]))
+        tries = (
+            _free(arm, scene, (se3.make(_down(*turns), (*middle, table.top_z + up)) for turns in product(_YAWS, tilts)))
+            for up, tilts in ways
+        )
+        over = next(filter(None, tries), [])
         shoulder = arm.description.link_pose(arm.description.arm(arm.name).base, state)[:3, 3]
         places = product(_LEANS, _HEIGHTS, _AHEAD)
         points = [
@@ -126,7 +136,7 @@ def postures(
         ]
         homes = _free(arm, scene, (se3.make(_down(math.pi / 2.0, -lean), p) for lean, p in points))
         if not over or not homes:
-            raise OpenArmError(Code.UNREACHABLE, f"the {arm.name} arm has no free posture over the table")
+            raise OpenArmError(Code.UNREACHABLE, f"arm {arm.name!r} has no free posture over the table")
         middle_q = 0.5 * (np.maximum(arm.lower, -math.pi) + np.minimum(arm.upper, math.pi))
         ready = min(over, key=lambda q: float(np.abs(q - middle_q).max()))
         hidden = [_hidden(arm, q, state, table.top_z, region, eye) for q in homes]

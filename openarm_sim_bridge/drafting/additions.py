@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.robot.convex import hull_of
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.xml_text import floats
 from openarm_common.types import Array
-from openarm_sim_bridge.drafting.hand import measured
-from openarm_sim_bridge.drafting.mjcf import WORLD, fixed_joint, set_origin, shape_element
+from openarm_sim_bridge.drafting.hand import measured, surface
+from openarm_sim_bridge.drafting.mjcf import TENSOR, WORLD, fixed_joint, set_origin, shape_element
 
 #: Edge of the column that is seen under a robot on a stand, m.
 _COLUMN = 0.16
+#: Density of what has no mass, kg/m3; least mass, kg, and size, m, of it.
+_WATER, _LEAST_MASS, _LEAST_SIZE = 1000.0, 0.01, 0.02
 #: Fastest plans, rad/s; acceleration and jerk are so many times that.
 _SPEED, _ACCELERATION, _JERK = 2.0, 3.0, 30.0
 #: Of a joint without a limit, N m; gain for each N m that it can do, and damping for each of that; kg m2 for each.
@@ -94,14 +98,20 @@ def add_hands(
     return {"hand": first}, remarks
 
 
+def lift(robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the joint that carries all arms and slides, the last of several; nothing without one."""
+    first, *others = [robot.chain(arm["base"]) for arm in parts.values()]
+    return [j.name for j in first if j.type == "prismatic" and j.mimic is None and all(j in one for one in others)][-1:]
+
+
 def fix_undriven(root: ET.Element, robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Fix the joints that neither an arm nor a hand drives, as near to 0 as their limits let them; returns remarks.
 
-    What slides below all arms stays, for it may be a lift.
+    The lift stays.
     """
-    driven = {name for arm in parts.values() for name in (*arm["joints"], arm["finger_joint"])}
-    below = [{joint.name for joint in robot.chain(arm["base"])} for arm in parts.values()]
-    driven |= {name for name in set.intersection(*below) if robot.joints[name].type == "prismatic"}
+    driven = {name for arm in parts.values() for name in (*arm["joints"], arm["finger_joint"])} | set(
+        lift(robot, parts)
+    )
     moving = [joint for joint in robot.joints.values() if joint.type != "fixed"]
     loose = {joint.name: joint for joint in moving if not driven & {joint.name, joint.mimic}}
     zero = {name: float(np.clip(0.0, joint.lower, joint.upper)) for name, joint in robot.joints.items()}
@@ -115,6 +125,69 @@ def fix_undriven(root: ET.Element, robot: RobotDescription, parts: Mapping[str, 
         element.set("type", "fixed")
         set_origin(element, joint.T_parent_joint @ joint.motion(q))
     return [f"fixed at 0, since no arm and no hand drives them: {', '.join(loose)}"] if loose else []
+
+
+def add_masses(root: ET.Element, robot: RobotDescription) -> list[str]:
+    """Weigh what moves without a mass, and give what has an inertia that no body has one of its size; returns remarks.
+
+    MuJoCo reads neither. What is weighed is as heavy as water in the shapes that collide.
+    """
+    elements = {element.get("name", ""): element for element in root.findall("link")}
+    given = {name: _mass_of(element) for name, element in elements.items()}
+    wrong = [name for name, (_, tensor) in given.items() if tensor.any() and not _is_inertia(tensor)]
+    groups = [fixed_to(robot, joint.child) for joint in robot.joints.values() if joint.type != "fixed"]
+    light = [
+        name
+        for group in groups
+        if not any(given[one][0] > 0.0 and given[one][1].any() for one in group)
+        for name in [one for one in group if robot.links[one].collision] or group[:1]
+    ]
+    weighed: dict[str, float] = {}
+    for name in dict.fromkeys([*wrong, *light]):
+        points = np.concatenate([np.zeros((1, 3)), *map(surface, robot.links[name].collision)])
+        points = points[1:] if len(points) > 1 else points
+        volume = sum(hull_of(surface(shape))[1] for shape in robot.links[name].collision)
+        mass = given[name][0]
+        if mass <= 0.0:
+            mass = weighed[name] = max(_WATER * volume, _LEAST_MASS)
+        _set_mass(elements[name], mass, points.min(axis=0), points.max(axis=0))
+    remarks: list[str] = []
+    if weighed:
+        what = f"no mass: {', '.join(weighed)}; taken as heavy as water, {sum(weighed.values()):.3g} kg together"
+        remarks.append(f"{what}; where it is known, give it in <inertial> of the URDF")
+    if others := [name for name in [*wrong, *light] if name not in weighed]:
+        remarks.append(
+            f"an inertia that no body has: {', '.join(dict.fromkeys(others))}; taken as that of a box instead"
+        )
+    return remarks
+
+
+def _mass_of(link: ET.Element) -> tuple[float, Array]:
+    """Mass of a link, kg, and inertia (3, 3), kg m2; 0 where it has none."""
+    mass, inertia = link.find("inertial/mass"), link.find("inertial/inertia")
+    tensor = np.zeros((3, 3))
+    if inertia is not None:
+        for key, (i, k) in TENSOR.items():
+            tensor[i, k] = tensor[k, i] = floats(inertia.get(key, "0"), 1, inertia)[0]
+    return 0.0 if mass is None else floats(mass.get("value", "0"), 1, mass)[0], tensor
+
+
+def _is_inertia(tensor: Array) -> bool:
+    """Whether moments are above 0, and none is larger than the two others together."""
+    a, b, c = np.linalg.eigvalsh(tensor)
+    return bool(a > 0.0 and a + b >= c)
+
+
+def _set_mass(link: ET.Element, mass: float, low: Array, high: Array) -> None:
+    """Give a link the mass and inertia of a box."""
+    for element in link.findall("inertial"):
+        link.remove(element)
+    inertial = ET.SubElement(link, "inertial")
+    set_origin(inertial, se3.make(p=0.5 * (low + high)))
+    x, y, z = np.maximum(high - low, _LEAST_SIZE) ** 2
+    moments = mass / 12.0 * np.diag([y + z, x + z, x + y])
+    ET.SubElement(inertial, "mass", value=f"{mass:.6g}")
+    ET.SubElement(inertial, "inertia", {key: f"{moments[at]:.6g}" for key, at in TENSOR.items()})
 
 
 def drives(robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -132,6 +205,14 @@ def drives(robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]]) -> d
     motion = {"velocity": _row(1.0, speed), "acceleration": _row(_ACCELERATION, speed), "jerk": _row(_JERK, speed)}
     motors = {"gains": gains, "stiff": gains, "armature": _row(_ARMATURE, effort), "gravity_compensation": 1.0}
     return {"motion": motion, "motors": motors}
+
+
+def fixed_to(robot: RobotDescription, link: str) -> list[str]:
+    """Return a link and those that are fixed to it, directly or by others."""
+    found = [link]
+    for name in found:
+        found += [joint.child for joint in robot.joints.values() if joint.type == "fixed" and joint.parent == name]
+    return found
 
 
 def _known(limit: float, otherwise: float) -> float:

@@ -17,13 +17,13 @@ from openarm_common.robot.meshes import is_convex, mesh_file, read_mesh
 from openarm_common.robot.xacro_files import description_text
 from openarm_common.robot.xml_text import attribute, child, floats, parse_root
 from openarm_sim_bridge.drafting.collisions import coarse_hull
-from openarm_sim_bridge.drafting.edits import Edits, matching
+from openarm_sim_bridge.drafting.edits import Edits, matches, matching
 from openarm_sim_bridge.drafting.mesh_files import MOST, is_binary_stl, simplified, write_stl
 
 _PARTS = ("link", "joint", "material", "mujoco")
 _TAGS = ("visual", "collision")
 #: What edits can say of a URDF.
-_OF_URDF = ("range", "velocity", "effort", "base", "stand", "turn")
+_OF_URDF = ("range", "velocity", "effort", "mimic", "fixed", "hulls", "base", "stand", "turn")
 #: Colour of what has a texture.
 _GREY = "0.5 0.5 0.5 1"
 
@@ -32,12 +32,13 @@ class AdoptedUrdf:
     """A maker's URDF that depends on no file out of its folder, with a name of its own for each shape.
 
     Visual meshes become files that MuJoCo reads, collision meshes few convex hulls. Textures are left out, and what is
-    of other programs, such as `ros2_control`; so is a branch that is fixed to a link which the file does not have.
+    of other programs, such as `ros2_control`; so is a branch that is fixed to a link which the file does not have, and
+    a visual mesh that is not there: the link then shows its collision shapes.
 
     Args:
         source: URDF, or xacro.
         folder: Folder of the draft.
-        edits: Limits of joints; where the robot stands is added by the draft.
+        edits: Of joints and `hulls`; where the robot stands is added by the draft.
         arguments: Of xacro, by name.
         packages: Folders of packages by name.
 
@@ -67,7 +68,8 @@ class AdoptedUrdf:
             for texture in material.findall("texture"):
                 material.remove(texture)
                 child(material, "color").attrib.setdefault("rgba", _GREY)
-        self._limit(edits)
+        self._change_joints(edits)
+        self.remarks += self._without_lost_meshes(edits)
         for tag in _TAGS:
             for link in self._root.findall("link"):
                 self._take_meshes(link, tag)
@@ -78,11 +80,15 @@ class AdoptedUrdf:
         ET.indent(self._root)
         return ET.tostring(self._root, encoding="unicode") + "\n"
 
-    def _limit(self, edits: Edits) -> None:
+    def _change_joints(self, edits: Edits) -> None:
         for joint in self._root.findall("joint"):
+            name = joint.get("name", "")
+            if matches(edits.fixed, name):
+                joint.set("type", "fixed")
             if joint.get("type") not in ("revolute", "continuous", "prismatic"):
                 continue
-            name = joint.get("name", "")
+            if follow := matching(edits.mimic, name, None):
+                child(joint, "mimic").attrib = {key: str(value) for key, value in follow.model_dump().items()}
             span = matching(edits.range, name, None)
             said = {key: matching(getattr(edits, key), name, None) for key in ("velocity", "effort")}
             if span is not None:
@@ -93,6 +99,41 @@ class AdoptedUrdf:
                 # urdfdom reads no joint without the limits of effort and velocity; 0: not known
                 limit = child(joint, "limit")
                 limit.attrib = {"effort": "0", "velocity": "0"} | limit.attrib | values
+
+    def _without_lost_meshes(self, edits: Edits) -> tuple[str, ...]:
+        """Take out visual meshes that are not there, and give links of `hulls` their visuals to collide with."""
+        lost: list[str] = []
+        bare: list[str] = []
+        for link in self._root.findall("link"):
+            name = attribute(link, "name")
+            for shape in link.findall("visual") if link.find("collision") is not None else ():
+                mesh = shape.find("geometry/mesh")
+                if mesh is not None and not self._is_there(mesh):
+                    lost.append(mesh.get("filename", ""))
+                    link.remove(shape)
+                    if link.find("visual") is None:
+                        _copy_shapes(link, "collision", "visual")
+            if matches(edits.hulls, name):
+                for shape in link.findall("collision"):
+                    link.remove(shape)
+                _copy_shapes(link, "visual", "collision")
+            if link.find("visual") is not None and link.find("collision") is None:
+                bare.append(name)
+        remarks: list[str] = []
+        if lost:
+            what = f"left out visual meshes that are not there: {', '.join(dict.fromkeys(lost))}"
+            remarks.append(f"{what}; a link that has no other shows its collision shapes")
+        if bare:
+            way = "`hulls: [LINK]` in --edits of a new draft gives them hulls of what is seen"
+            remarks.append(f"links that are seen and collide with nothing: {', '.join(bare)}; {way}")
+        return tuple(remarks)
+
+    def _is_there(self, mesh: ET.Element) -> bool:
+        try:
+            mesh_file(mesh.get("filename", ""), self._source, self._packages)
+        except OpenArmError:
+            return False
+        return True
 
     def _take_meshes(self, link: ET.Element, tag: str) -> None:
         for shape in link.findall(tag):
@@ -181,6 +222,15 @@ def _without_orphans(root: ET.Element) -> tuple[str, ...]:
         what = f"joint {joint.get('name')!r} fixes it to {parent!r}, which the file does not have"
         remarks.append(f"left out {', '.join(branch)}: {what}")
     return tuple(remarks)
+
+
+def _copy_shapes(link: ET.Element, tag: str, to: str) -> None:
+    """Give a link the shapes of one tag under another one too."""
+    for shape in link.findall(tag):
+        part = copy.deepcopy(shape)
+        part.tag = to
+        part.attrib.pop("name", None)
+        link.append(part)
 
 
 def _link(joint: ET.Element, role: str) -> str:

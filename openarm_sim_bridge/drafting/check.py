@@ -14,6 +14,7 @@ from openarm_common.robot.description import RobotDescription, part_faults
 from openarm_common.robot.folder import RobotFolder, read_folder
 from openarm_common.robot.meshes import mesh_file
 from openarm_sim_bridge.drafting.collisions import LinkContacts
+from openarm_sim_bridge.drafting.semantics import SOURCE
 from openarm_sim_bridge.world.model import import_urdf
 
 #: How far a posture may be outside of a limit, which has fewer digits in other files, rad.
@@ -42,7 +43,7 @@ def folder_faults(folder: Path) -> list[str]:
     always = sorted(map(sorted, contacts.always_touching() - robot.allowed_collisions))
     return [
         *faults,
-        *_posture_faults(robot, contacts),
+        *_posture_faults(robot, contacts, folder),
         *(f"{' and '.join(pair)} touch in every random state, and the SRDF does not allow it" for pair in always),
         *_mujoco_faults(robot, urdf),
     ]
@@ -81,7 +82,8 @@ def _pad_faults(parts: RobotFolder, robot: RobotDescription) -> Iterator[str]:
     for name, arm in parts.arms.items():
         for finger in arm.fingers:
             if f"{finger}_pad_collision" not in shapes:
-                yield f"arms.{name}: finger {finger!r} has no collision shape {finger}_pad_collision"
+                way = f'give the link a box that grips, <collision name="{finger}_pad_collision">, in the URDF'
+                yield f"arms.{name}: finger {finger!r} has no pad; {way}"
 
 
 def _group_faults(robot: RobotDescription) -> Iterator[str]:
@@ -95,19 +97,25 @@ def _group_faults(robot: RobotDescription) -> Iterator[str]:
     )
 
 
-def _posture_faults(robot: RobotDescription, contacts: LinkContacts) -> Iterator[str]:
+def _posture_faults(robot: RobotDescription, contacts: LinkContacts, folder: Path) -> Iterator[str]:
     homes = [robot.semantics.states.get((f"{arm}_arm", "home"), {}) for arm in robot.arms]
     others = {joint: value for home in homes for joint, value in home.items()}
+    at_home = contacts.at(others) - robot.allowed_collisions
     touching: dict[tuple[str, ...], list[str]] = {}
     for (group, name), state in robot.semantics.states.items():
         for joint, value in state.items():
             lower, upper = robot.joint(joint).lower, robot.joint(joint).upper
             if not lower - _ROUNDED <= value <= upper + _ROUNDED:
                 yield f"posture {name!r} of {group}: {joint} at {value:g}, expected {lower:g} .. {upper:g}"
-        for pair in contacts.at({**others, **state}) - robot.allowed_collisions:
-            touching.setdefault(tuple(sorted(pair)), []).append(f"{name!r} of {group}")
+        found = contacts.at({**others, **state}) - robot.allowed_collisions
+        for pair in found - at_home if group.endswith("_gripper") else found:  # arms are at home where a hand moves
+            touching.setdefault(tuple(sorted(pair)), []).append(repr(name))
+    by_posture: dict[str, list[str]] = {}
     for pair, postures in sorted(touching.items()):
-        yield f"{' and '.join(pair)} touch in posture {', '.join(postures)}"
+        by_posture.setdefault(", ".join(dict.fromkeys(postures)), []).append(" and ".join(pair))
+    way = f"give another one in {SOURCE}, or name pairs whose parts don't touch in may_touch there"
+    for postures, pairs in by_posture.items():
+        yield f"posture {postures}: {', '.join(pairs)} touch; {way}, then `openarm model semantics {folder}`"
 
 
 def _mujoco_faults(robot: RobotDescription, urdf: Path) -> Iterator[str]:

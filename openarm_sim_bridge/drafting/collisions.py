@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
 import coal
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import ConvexHull, QhullError
 
+from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.robot.convex import hull_of
 from openarm_common.robot.description import Joint, Primitive, RobotDescription
@@ -20,6 +22,7 @@ from openarm_common.types import Array
 Pair = frozenset[str]
 #: States in which links must touch that always do.
 _ALWAYS = 1000
+_FREE: Mapping[str, float] = MappingProxyType({})
 #: Most triangles of a coarse hull, and grids that its corners move to, m.
 _HULL_FACES, _GRIDS = 300, (0.001, 0.002, 0.003, 0.004, 0.006, 0.008, 0.012)
 #: Most triangles at a corner that coal takes.
@@ -81,14 +84,22 @@ class LinkContacts:
             left -= hits
         return found
 
-    def always_touching(self, samples: int = _ALWAYS, seed: int = 0) -> set[Pair]:
-        """Return the pairs of links that touch in every random state."""
-        left, rng = set(self._pairs), np.random.default_rng(seed)
-        for _ in range(samples):
-            left = self._hits(self._random(rng), left)
-            if not left:
-                break
-        return left
+    def always_touching(self, share: float = 1.0, held: Mapping[str, float] = _FREE) -> set[Pair]:
+        """Return the pairs of links that touch in every random state.
+
+        Args:
+            share: Of the states, in which they touch at least.
+            held: Positions of joints that stay there.
+        """
+        left = dict.fromkeys(self._pairs, round((1.0 - share) * _ALWAYS))
+        rng = np.random.default_rng(0)
+        for _ in range(_ALWAYS):
+            q = self._random(rng)
+            for name, value in held.items():
+                self._put(q, name, value)
+            hits = self._hits(self._followed(q), set(left))
+            left = {pair: free - (pair not in hits) for pair, free in left.items() if free or pair in hits}
+        return set(left)
 
     def at(self, state: Mapping[str, float]) -> set[Pair]:
         """Return the pairs of links that touch in a state; joints that it does not name are at 0, followers follow."""
@@ -139,6 +150,16 @@ def coal_shape(shape: Primitive) -> coal.CollisionGeometry:
     if shape.kind == "box":
         return coal.Box(*shape.size)
     return coal.Cylinder(*shape.size) if shape.kind == "cylinder" else coal.Sphere(*shape.size)
+
+
+def corners_of(shape: Primitive) -> Array:
+    """Return the corners (n, 3) of a shape, in the frame of its link; of a cylinder or sphere, of the box about it."""
+    corners = shape.corners
+    if corners is None:
+        size = shape.size
+        edges = {"box": size, "cylinder": (2.0 * size[0], 2.0 * size[0], size[-1]), "sphere": (2.0 * size[0],) * 3}
+        corners = 0.5 * np.array(edges[shape.kind]) * np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
+    return se3.apply(shape.T_link_primitive, corners)
 
 
 def _fits_coal(triangles: NDArray[np.int64]) -> bool:

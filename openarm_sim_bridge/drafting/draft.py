@@ -22,12 +22,13 @@ from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Joint, RobotDescription
 from openarm_common.types import Array
-from openarm_sim_bridge.drafting.additions import add_hands, add_stand, drives, fix_undriven
+from openarm_sim_bridge.drafting.additions import add_hands, add_masses, add_stand, drives, fix_undriven, fixed_to, lift
 from openarm_sim_bridge.drafting.adopted import AdoptedUrdf
 from openarm_sim_bridge.drafting.collisions import LinkContacts, adjacent_pairs
 from openarm_sim_bridge.drafting.edits import Edits
+from openarm_sim_bridge.drafting.hand import surface
 from openarm_sim_bridge.drafting.mjcf import UrdfDraft, compiled
-from openarm_sim_bridge.drafting.semantics import SOURCE, write_srdf
+from openarm_sim_bridge.drafting.semantics import SOURCE, rewrite_states, write_srdf
 
 _LICENSED = "# SPDX-License-Identifier: Apache-2.0\n"
 _HEAD = f"""{_LICENSED}# Drafted by `openarm model new` from {{source}}: review it, then ask `openarm model check`.
@@ -36,6 +37,10 @@ _NOTHING: Mapping[str, str] = MappingProxyType({})
 _NOWHERE: Mapping[str, Path] = MappingProxyType({})
 #: Lowest table that a robot can work at, and how high it stands whose arms are lower, m.
 _LOWEST_TABLE, _STAND = 0.05, 0.45
+#: Postures that are tried in place of one in which links touch.
+_DRAWS = 400
+#: Least travel of two fingers to each other, m.
+_CLOSES = 0.002
 _LICENCE = "<!-- SPDX-License-Identifier: Apache-2.0 -->\n"
 
 
@@ -130,29 +135,55 @@ def _drafted(
         remarks += adopted.remarks
         urdf.write_text(adopted.text(), encoding="utf-8")
     robot = RobotDescription.from_files(urdf)
+    root = ET.fromstring(urdf.read_text(encoding="utf-8"))
+    if twins := [found for arm, ends in arms.items() if (found := twin(robot, arm_parts(robot, arm, *ends)[0]))]:
+        for element in root.findall("joint"):
+            for follower, leader, multiplier, offset in twins:
+                if element.get("name") == follower:
+                    numbers = {"multiplier": f"{multiplier:g}", "offset": f"{offset:.13g}"}
+                    ET.SubElement(element, "mimic", {"joint": leader} | numbers)
+                    remarks.append(f"{follower!r} is taken to follow {leader!r}, as the other finger of its hand")
+        _write_urdf(urdf, root, licensed=False)
+        robot = RobotDescription.from_files(urdf)
     parts: dict[str, dict[str, Any]] = {}
     for arm, (base, tip) in arms.items():
         parts[arm], guesses = arm_parts(robot, arm, base, tip)
         remarks += guesses
     base = wanted.base if source.suffix == ".xml" else robot.root
-    root = ET.fromstring(urdf.read_text(encoding="utf-8"))
     if source.suffix != ".xml" and (stand := _stand(robot, parts, wanted)) is not None:
         base = wanted.base if "base" in wanted.model_fields_set else f"{name}_stand"
         add_stand(root, robot, base, stand, wanted.turn)
         if "stand" not in wanted.model_fields_set:
             what = f"{robot.root!r} stands on {base!r}, {stand[2]:g} m high, as the table"
             remarks.append(f"{what}; `stand: [X, Y, Z]` in --edits of a new draft changes that")
-    remarks += fix_undriven(root, robot, parts)
+    remarks += fix_undriven(root, robot, parts) + add_masses(root, robot)
     hand, notes = add_hands(root, robot, parts)
     _write_urdf(urdf, root, licensed=source.suffix == ".xml")
     robot = RobotDescription.from_files(urdf)
     signs = mirror_signs(robot, [part["joints"] for part in parts.values()])
-    content = {"urdf": urdf.name, "srdf": f"{name}.srdf", "base": base, **hand, **drives(robot, parts), "arms": parts}
+    content: dict[str, Any] = {
+        "urdf": urdf.name,
+        "srdf": f"{name}.srdf",
+        "base": base,
+        **hand,
+        **drives(robot, parts),
+        "arms": parts,
+    }
+    for joint in lift(robot, parts):
+        home = float(np.clip(0.0, robot.joints[joint].lower, robot.joints[joint].upper))
+        content["lift"] = {"joint": joint, "home": home}
     head = _HEAD.format(source=source.name)
     write_yaml(folder / "robot.yaml", content | {"mirror": signs}, head)
-    if not (folder / SOURCE).exists():
-        write_yaml(folder / SOURCE, _first_semantics(robot, parts) | {"samples": samples}, head)
-    return Draft(write_srdf(folder)[1], tuple(remarks + notes))
+    if (folder / SOURCE).exists():
+        return Draft(write_srdf(folder)[1], tuple(remarks + notes))
+    first: dict[str, Any] = {**_first_semantics(robot, parts), "samples": samples}
+    write_yaml(folder / SOURCE, first, head)
+    srdf, reasons = write_srdf(folder)
+    if home := _free_home(RobotDescription.from_files(urdf, srdf), first["postures"]["home"], parts):
+        write_yaml(folder / SOURCE, first | {"postures": {"home": home}})
+        rewrite_states(folder)
+        notes.append("links touch with all joints at 0; posture 'home' is another, where none do")
+    return Draft(reasons, tuple(remarks + notes))
 
 
 def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -193,40 +224,71 @@ def arm_parts(robot: RobotDescription, name: str, base: str, tip: str) -> tuple[
         remarks.append(f"arms.{name}: joints that turn without end: {', '.join(endless)}; {way}")
     if leader is not None and others:
         what = f"arms.{name}: finger_joint {leader.name!r} is a guess; further joints of the hand: {', '.join(others)}"
-        way = "couple to it what follows it, by <mimic> of a URDF, or mimic and fixed of edits of an MJCF"
+        way = "couple to it what follows it, by `mimic` in --edits of a new draft"
         remarks.append(f"{what}; where another one drives the hand, change robot.yaml; {way}")
     elif others:
         what = f"arms.{name}: no joint of the hand has limits, so it has no fingers: {', '.join(others)}"
-        remarks.append(f"{what}; give one limits, then draft again")
+        remarks.append(f"{what}; give one `range: {{{others[0]}: [LOWER, UPPER]}}` in --edits and draft again")
     if len(moved) == 1:
         what = f"arms.{name}: {moved[0].name!r} moves one finger, {moved[0].child!r}"
         way = f"where the other is a part of {moved[0].parent!r}, add that to fingers in robot.yaml"
         remarks.append(f"{what}; {way}; which end is closed is a guess, see gripper in semantics.yaml")
+    hand = leader.parent if leader is not None else chain[-1].parent
     parts = {
         "base": base,
         "joints": [joint.name for joint in joints],
         "flange": flange,
-        "hand": leader.parent if leader is not None else chain[-1].parent,
+        "hand": hand,
         "tcp": tip,
         "finger_joint": leader.name if leader is not None else "",
-        "fingers": _ends(robot, [joint.child for joint in moved]),
+        "fingers": _ends(robot, [joint.child for joint in moved], hand),
     }
     return parts, tuple(remarks)
 
 
-def _ends(robot: RobotDescription, links: list[str]) -> list[str]:
-    """Links that most of the others carry: the fingers of a linkage, not what moves them; of each, what has its pad."""
+def twin(robot: RobotDescription, arm: Mapping[str, Any]) -> tuple[str, str, float, float] | None:
+    """Return the joint of the other finger of a hand that no description couples, with leader, multiplier and offset.
+
+    It is of the kind, travel and parent of the first, the only one such, and comes nearer to it where both move.
+    """
+    leader = robot.joints.get(arm["finger_joint"])
+    if leader is None or any(joint.mimic == leader.name for joint in robot.joints.values()):
+        return None
+
+    def kind(joint: Joint) -> tuple[str, str, float]:
+        return joint.type, joint.parent, round(joint.upper - joint.lower, 4)
+
+    alike = [
+        one for one in robot.joints.values() if one is not leader and one.mimic is None and kind(one) == kind(leader)
+    ]
+    if len(alike) != 1 or alike[0].name in arm["joints"]:
+        return None
+    (other,) = alike
+    both = {**arm, "fingers": [*arm["fingers"], *_ends(robot, [other.child], arm["hand"])]}
+    ways = [(1.0, other.lower - leader.lower), (-1.0, other.upper + leader.lower)]
+
+    def closes(way: tuple[float, float]) -> float:
+        ends = [{leader.name: q, other.name: way[0] * q + way[1]} for q in (leader.lower, leader.upper)]
+        return abs(_gap(robot, both, ends[0]) - _gap(robot, both, ends[1]))
+
+    best = max(ways, key=closes)
+    return (other.name, leader.name, *best) if closes(best) > _CLOSES else None
+
+
+def _ends(robot: RobotDescription, links: list[str], hand: str) -> list[str]:
+    """Links that most of the others carry: the fingers of a linkage, not what moves them.
+
+    Of each it is, of what is fixed to it, the link that has its pad, or reaches farthest from the hand.
+    """
     carried = {link: len(_links_to(robot, link) & set(links)) for link in links}
+    poses = robot.link_poses(dict.fromkeys(robot.joints, 0.0))
+
+    def outermost(link: str) -> tuple[bool, float]:
+        points = [se3.apply(se3.inverse(poses[hand]) @ poses[link], surface(s)) for s in robot.links[link].collision]
+        return _has_pad(robot, link), max((float(np.linalg.norm(p, axis=1).max()) for p in points), default=0.0)
+
     ends = [link for link in links if carried[link] == max(carried.values())]
-    return [next((link for link in _fixed_to(robot, end) if _has_pad(robot, link)), end) for end in ends]
-
-
-def _fixed_to(robot: RobotDescription, link: str) -> list[str]:
-    """Links that are fixed to one, directly or by others."""
-    found = [link]
-    for name in found:
-        found += [joint.child for joint in robot.joints.values() if joint.type == "fixed" and joint.parent == name]
-    return found
+    return [max(fixed_to(robot, end), key=outermost) for end in ends]
 
 
 def _has_pad(robot: RobotDescription, link: str) -> bool:
@@ -272,8 +334,10 @@ def _links_to(robot: RobotDescription, link: str) -> set[str]:
 def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Postures to begin with: all joints as near to 0 as their limits let them, the fingers at both ends.
 
-    Links of one hand may touch that do so there, such as those of a linkage, whose hulls overlap.
+    Links of one hand may touch that do so there, such as those of a linkage, whose hulls overlap; so may those that
+    only a lift moves.
     """
+    driven = {joint for arm in parts.values() for joint in (*arm["joints"], arm["finger_joint"])}
     zero = {
         name: [float(np.clip(0.0, robot.joints[j].lower, robot.joints[j].upper)) for j in arm["joints"]]
         for name, arm in parts.items()
@@ -281,12 +345,17 @@ def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, A
     ends: dict[str, dict[str, float]] = {"open": {}, "closed": {}}
     touching: set[tuple[str, ...]] = set()
     contacts = LinkContacts(robot)
+    still = {link for link in robot.links if not driven & {joint.name for joint in robot.chain(link)}}
+    for carrier in lift(robot, parts):
+        for end in (robot.joints[carrier].lower, robot.joints[carrier].upper):
+            found = contacts.at({carrier: end}) - adjacent_pairs(robot)
+            touching |= {tuple(sorted(pair)) for pair in found if pair <= still}
     for name, arm in parts.items():
         touching |= {tuple(sorted(pair)) for pair in itertools.pairwise(arm["fingers"])}
         if arm["finger_joint"]:
             joint = robot.joints[arm["finger_joint"]]
             ends["closed"][name], ends["open"][name] = sorted(
-                (joint.lower, joint.upper), key=lambda q: (round(_gap(robot, arm, q), 6), abs(q))
+                (joint.lower, joint.upper), key=lambda q: (round(_gap(robot, arm, {joint.name: q}), 6), abs(q))
             )
             hand = {link for link in robot.links if arm["flange"] in _links_to(robot, link)}
             for end in (joint.lower, joint.upper, float(np.clip(0.0, joint.lower, joint.upper))):
@@ -297,9 +366,25 @@ def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, A
     return {"postures": {"home": zero, "zero": zero}, "gripper": gripper, "may_touch": pairs}
 
 
-def _gap(robot: RobotDescription, arm: Mapping[str, Any], position: float) -> float:
+def _free_home(
+    robot: RobotDescription, zero: Mapping[str, list[float]], parts: Mapping[str, Mapping[str, Any]]
+) -> dict[str, list[float]] | None:
+    """Return postures of all arms in which no links touch, near to those given; None where these do, or none does."""
+    contacts, rng = LinkContacts(robot), np.random.default_rng(0)
+    joints = [robot.joints[joint] for arm in parts.values() for joint in arm["joints"]]
+    given = np.concatenate([zero[arm] for arm in parts])
+    low, high = (np.clip([getattr(j, end) for j in joints], -np.pi, np.pi) for end in ("lower", "upper"))
+    for share in np.linspace(0.0, 1.0, _DRAWS):
+        q = (given + share * (rng.uniform(low, high) - given)).round(3)
+        if not contacts.at({j.name: float(v) for j, v in zip(joints, q, strict=True)}) - robot.allowed_collisions:
+            rows = np.split(q, np.cumsum([len(zero[arm]) for arm in parts])[:-1])
+            return {arm: row.tolist() for arm, row in zip(parts, rows, strict=True)} if share else None
+    return None
+
+
+def _gap(robot: RobotDescription, arm: Mapping[str, Any], state: Mapping[str, float]) -> float:
     """Mean distance of an arm's fingers, or of its only one from the tool centre point, m."""
-    poses = robot.link_poses({**dict.fromkeys(robot.joints, 0.0), arm["finger_joint"]: position})
+    poses = robot.link_poses({**dict.fromkeys(robot.joints, 0.0), **state})
     middles = [poses[arm["tcp"]][:3, 3]] if len(arm["fingers"]) == 1 else []
     for finger in arm["fingers"]:
         shapes = robot.links[finger].collision

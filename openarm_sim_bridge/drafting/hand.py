@@ -13,7 +13,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.robot.description import Primitive, RobotDescription
 from openarm_common.types import Array
-from openarm_sim_bridge.drafting.collisions import hull_mesh
+from openarm_sim_bridge.drafting.collisions import corners_of, hull_mesh
 
 #: Positions of the finger joint at which a hand is measured; finger at which its frame and pads are made, m.
 _STEPS, _USUAL = 9, 0.025
@@ -264,15 +264,6 @@ def _snapped(v: Array, cosine: float) -> Array:
 
 def surface(shape: Primitive) -> Array:
     """Return points (n, 3) all over a shape, in the frame of its link; of a cylinder or sphere, of the box about it."""
-    half = np.array(shape.size)
-    if shape.kind == "box":
-        half = 0.5 * half
-    else:
-        half = np.array([half[0], half[0], 0.5 * half[-1] if shape.kind == "cylinder" else half[0]])
-    corners = shape.corners
-    if corners is None:
-        corners = half * np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
-    vertices, triangles = hull_mesh(corners)
+    vertices, triangles = hull_mesh(corners_of(shape))
     weights = np.array([(i, j, _GRAIN - i - j) for i in range(_GRAIN + 1) for j in range(_GRAIN + 1 - i)]) / _GRAIN
-    points = np.einsum("wk,tkx->twx", weights, vertices[triangles]).reshape(-1, 3)
-    return se3.apply(shape.T_link_primitive, points)
+    return np.einsum("wk,tkx->twx", weights, vertices[triangles]).reshape(-1, 3)

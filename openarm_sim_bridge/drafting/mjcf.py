@@ -30,6 +30,8 @@ _GEOM, _JOINT = mujoco.mjtGeom, mujoco.mjtJoint
 WORLD = "world"
 _TAGS = ("visual", "collision")
 _UNCHANGED = Edits()
+#: Places of the components of an inertia.
+TENSOR = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 #: A MuJoCo camera looks along -z with y up, an optical frame along z with y down.
 _OPTICAL = se3.make(se3.rot_x(math.pi))
 
@@ -199,8 +201,7 @@ class UrdfDraft:
         element = ET.SubElement(link, "inertial")
         ET.SubElement(element, "origin", xyz=_numbers(model.body_ipos[body] - self._offsets[body]), rpy="0 0 0")
         ET.SubElement(element, "mass", value=_numbers([model.body_mass[body]]))
-        rows = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-        ET.SubElement(element, "inertia", {key: _numbers([tensor[at]]) for key, at in rows.items()})
+        ET.SubElement(element, "inertia", {key: _numbers([tensor[at]]) for key, at in TENSOR.items()})
 
     def _boxes(self, link: ET.Element, boxes: Iterable[BoxEdit]) -> None:
         for tag in ("visual", "collision"):
