@@ -200,13 +200,16 @@ class ArmMachine:
         if self.phase is Phase.REFUSED:
             return
         if silent := [motor for motor in self.motors if not motor.seen]:
+            self._since_ns = now_ns
             self.text = (
                 f"no reply of {_named(silent)}; is the arm's power on, its bus up? `openarm hardware scan` says more"
             )
             return
         if unread := [motor for motor in self.motors if len(motor.registers) < 3]:
             errors = [motor.fault for motor in unread if motor.broken]
-            self.text = errors[0] if errors else f"asking {_named(unread)}"
+            self.text = (
+                errors[0] if errors else f"asking {_named(unread)}{self._patience('does not answer it', now_ns)}"
+            )
             return
         for motor in self.motors:
             last = self._last.get(motor.axis.joint)
@@ -223,7 +226,8 @@ class ArmMachine:
                 motor.forget()
             self._become(Phase.LOOKING, f"no reply of {_named(silent)}", now_ns)
         elif unset := [motor for motor in self.motors if not motor.configured]:
-            self.text = f"setting mode and timeout of {_named(unset)}"
+            late = self._patience(f"{unset[0].axis} does not take {unset[0].lacking}", now_ns)
+            self.text = f"setting mode and timeout of {_named(unset)}{late}"
         elif command is None:
             self.text = "waiting for a client"
         elif far := [m for m, (q, _) in zip(self.motors, command, strict=True) if not m.near(q)]:
@@ -279,6 +283,11 @@ class ArmMachine:
         asks = motor.configure(write=self.phase is Phase.SETTING)
         damps = self._sinks and not (self._cycles % 2 and asks != motor.refresh_frame())
         return motor.damping_frame() if damps else asks
+
+    def _patience(self, what: str, now_ns: int) -> str:
+        """Return what goes on for too long, and what to do; nothing before."""
+        way = "`openarm hardware scan` names its firmware, whose registers may be others"
+        return f": {what}; {way}" if now_ns - self._since_ns > _ENABLE_S * 1e9 else ""
 
     def _become(self, phase: Phase, why: str, now_ns: int) -> None:
         self.phase, self.text, self._since_ns = phase, why, now_ns

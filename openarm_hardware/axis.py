@@ -198,11 +198,21 @@ class MotorAxis:
         """Why its frames mean something else than is assumed; else nothing."""
         for key, unit in _RANGES.items():
             found = self.registers.get(key)
-            if found is not None and abs(found - self._wanted[key]) > 1e-3:
+            if found is not None and not abs(found - self._wanted[key]) <= 1e-3:  # it may be no number
                 text = f"{self.axis} has register {Register(key).name} = {found:g}, a {self.kind.name} has"
                 why = "its type in hardware.yaml is wrong, or the register was changed"
                 return f"{text} {self._wanted[key]:g} {unit}; {why}"
         return ""
+
+    @property
+    def lacking(self) -> str:
+        """The first register that has not the value it must have, in words; nothing when all have."""
+        wrong = [key for key, value in self._wanted.items() if self.registers.get(key) != value]
+        return (
+            f"{Register(wrong[0]).name} = {self._wanted[wrong[0]]:g}, has {self.registers.get(wrong[0])}"
+            if wrong
+            else ""
+        )
 
     def configure(self, *, write: bool) -> Frame:
         """Return the next frame that reads ranges or, with `write`, sets mode and timeout; else one that asks."""

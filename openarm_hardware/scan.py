@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.motors import frames
 from openarm_common.motors.bus import Bus, Frame, open_bus
-from openarm_common.motors.frames import HIGHEST_ID, ControlMode, Register
+from openarm_common.motors.frames import HIGHEST_ID, LAST_ID, ControlMode, Register
 from openarm_common.motors.wiring import Wiring
 
 #: Registers that are read, and for how long answers to one question are waited for, s.
@@ -91,21 +91,26 @@ def silence(address: str, wiring: Wiring) -> str:
 def unset(found: Iterable[Found], wiring: Wiring) -> list[str]:
     """Return which motors answer with other ids than is expected, and what to type."""
     shared, offset = dict[tuple[str, int], list[int]](), wiring.joints.reply_offset
+    said, known = list[str](), [(motor.bus, motor.id) for motor in found]
+    for bus, motor in dict.fromkeys(one for one in known if known.count(one) > 1):
+        free = next(i for i in range(1, LAST_ID + 1) if (bus, i) not in known)
+        way = f"connect one of them alone and type `openarm hardware set-id {bus} {motor} --to {free}`"
+        said.append(f"{known.count((bus, motor))} motors answer to id {motor} on {bus}; {way}, or another id")
     for motor in found:
-        if motor.reply_id != motor.id + offset:
+        if motor.reply_id != motor.id + offset and known.count((motor.bus, motor.id)) == 1:
             shared.setdefault((motor.bus, motor.reply_id), []).append(motor.id)
-    said = list[str]()
     for (bus, reply), ids in shared.items():
         who = f"motors {', '.join(map(str, ids[:-1]))} and {ids[-1]} answer" if ids[1:] else f"motor {ids[0]} answers"
-        todo = ", ".join(f"`openarm hardware set-id {bus} {motor}`" for motor in ids)
+        commands = [f"openarm hardware set-id {bus} {motor}{' --to ID' * (motor > LAST_ID)}" for motor in ids]
+        todo = ", ".join(f"`{command}`" for command in commands)
         on = f"id {hex(reply) if reply else 0}: not set up, expected the motor's own and {offset:#x}"
         said.append(f"{who} on {on}; type {todo}")
     return said
 
 
-def answering(bus: Bus) -> dict[int, int]:
-    """Return the ids of the replies of all motors of a bus, by their own."""
-    found = dict[int, int]()
+def answering(bus: Bus) -> list[tuple[int, int]]:
+    """Return the ids of all motors of a bus, each with that of its reply; twice where two motors have one id."""
+    found, others = list[tuple[int, int]](), list[tuple[int, int]]()
 
     def listen(seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -113,7 +118,7 @@ def answering(bus: Bus) -> dict[int, int]:
             for number, data in bus.receive():
                 answer = frames.decode_register(data)
                 if answer is not None and answer.register == Register.MST_ID:
-                    found[answer.id] = number
+                    (others if number == frames.REGISTER_ID else found).append((answer.id, number))
             time.sleep(0.001)
 
     for first in range(1, HIGHEST_ID + 1, _AT_ONCE):
@@ -121,7 +126,10 @@ def answering(bus: Bus) -> dict[int, int]:
         bus.send([frames.read_register(motor, Register.MST_ID) for motor in ids])
         listen(_STEP_S)
     listen(_WAIT_S)
-    return dict(sorted(found.items()))
+    for motor, _ in others:  # another process of this machine has asked too
+        if len(same := [one for one in found if one[0] == motor]) > 1:
+            found.remove(same[-1])
+    return sorted(found)
 
 
 def asked(
@@ -168,9 +176,9 @@ def _answer(bus: Bus, question: Frame, reply_id: int, motor: int, register: int 
 def _scan(address: str, *, flexible: bool) -> list[Found]:
     bus = open_bus(address, flexible=flexible)
     try:
-        reply_ids = answering(bus)
-        states, registers = asked(bus, reply_ids, _READ)
-        return [_found(address, i, n, states.get(i), registers.get(i, {})) for i, n in reply_ids.items()]
+        there = answering(bus)
+        states, registers = asked(bus, dict(there), _READ)
+        return [_found(address, i, n, states.get(i), registers.get(i, {})) for i, n in there]
     except OSError as error:
         if error.errno == errno.EINVAL:  # of an interface that is not set up for CAN FD
             return []

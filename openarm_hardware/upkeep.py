@@ -94,7 +94,13 @@ def set_id(address: str, motor: int, to: int, offset: int, *, flexible: bool) ->
     if not 1 <= to <= frames.LAST_ID:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"a motor's id can't be {to}, expected 1 to {frames.LAST_ID}")
     with _opened(address, flexible=flexible) as bus:
-        found = answering(bus)
+        there = answering(bus)
+        found = dict(there)
+        if (many := [i for i, _ in there].count(motor)) > 1:
+            text = (
+                f"{many} motors answer to id {motor} on {address}; connect one of them alone, then give it another id"
+            )
+            raise OpenArmError(Code.NOT_READY, text)
         if motor not in found:
             known = ", ".join(map(str, found)) or "none"
             text = f"motor {motor} does not answer on {address}; motors that do: {known}"
@@ -111,7 +117,7 @@ def set_id(address: str, motor: int, to: int, offset: int, *, flexible: bool) ->
         bus.send([frames.write_register(motor, Register.ESC_ID, to), frames.store_registers(to)])
         time.sleep(_STORE_S)
         bus.receive()
-        now = answering(bus)
+        now = dict(answering(bus))
         if now.get(to) != to + offset or (to != motor and motor in now):
             text = f"motor {motor} did not take id {to} with replies {to + offset}; motors with replies now: {now}"
             raise OpenArmError(Code.NOT_READY, text)

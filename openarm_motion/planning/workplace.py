@@ -85,7 +85,8 @@ def grasp_region(arms: Mapping[str, Arm], table: Table, state: Mapping[str, floa
         scene, sides = arm.scene(state, straight=True, gripper=arm.opened), _sides(arm, arms)
         hand = arm.description.hand(arm.name).parts
         for (i, x), (j, y) in product(enumerate(xs), enumerate(ys)):
-            free[i, j] &= all(_grasps_at(arm, scene, hand, (x, side * y), table.top_z) for side in sides)
+            if free[i, j]:  # for the arms before
+                free[i, j] = all(_grasps_at(arm, scene, hand, (x, side * y), table.top_z) for side in sides)
     corners = [
         (xs[b] - xs[a], ys[d] - ys[c], a, b, c, d)
         for a, b in product(range(len(xs)), repeat=2)

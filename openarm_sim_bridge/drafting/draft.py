@@ -37,6 +37,8 @@ _NOTHING: Mapping[str, str] = MappingProxyType({})
 _NOWHERE: Mapping[str, Path] = MappingProxyType({})
 #: Lowest table that a robot can work at, and how high it stands whose arms are lower, m.
 _LOWEST_TABLE, _STAND = 0.05, 0.45
+#: Links that touch in such a share of random states may, as in MoveIt's Setup Assistant (`min_collision_fraction`).
+_MOSTLY = 0.95
 #: Postures that are tried in place of one in which links touch.
 _DRAWS = 400
 #: Least travel of two fingers to each other, m.
@@ -177,6 +179,10 @@ def _drafted(
     if (folder / SOURCE).exists():
         return Draft(write_srdf(folder)[1], tuple(remarks + notes))
     first: dict[str, Any] = {**_first_semantics(robot, parts), "samples": samples}
+    if mostly := sorted(sorted(pair) for pair in _mostly_touching(robot, parts)):
+        first["may_touch"] += [pair for pair in mostly if pair not in first["may_touch"]]
+        what = f"not checked, since they touch in nearly all states: {', '.join(map(' and '.join, mostly))}"
+        notes.append(f"{what}; may_touch in {SOURCE} says so")
     write_yaml(folder / SOURCE, first, head)
     srdf, reasons = write_srdf(folder)
     if home := _free_home(RobotDescription.from_files(urdf, srdf), first["postures"]["home"], parts):
@@ -334,10 +340,8 @@ def _links_to(robot: RobotDescription, link: str) -> set[str]:
 def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Postures to begin with: all joints as near to 0 as their limits let them, the fingers at both ends.
 
-    Links of one hand may touch that do so there, such as those of a linkage, whose hulls overlap; so may those that
-    only a lift moves.
+    Links of one hand may touch that do so there, such as those of a linkage, whose hulls overlap.
     """
-    driven = {joint for arm in parts.values() for joint in (*arm["joints"], arm["finger_joint"])}
     zero = {
         name: [float(np.clip(0.0, robot.joints[j].lower, robot.joints[j].upper)) for j in arm["joints"]]
         for name, arm in parts.items()
@@ -345,11 +349,6 @@ def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, A
     ends: dict[str, dict[str, float]] = {"open": {}, "closed": {}}
     touching: set[tuple[str, ...]] = set()
     contacts = LinkContacts(robot)
-    still = {link for link in robot.links if not driven & {joint.name for joint in robot.chain(link)}}
-    for carrier in lift(robot, parts):
-        for end in (robot.joints[carrier].lower, robot.joints[carrier].upper):
-            found = contacts.at({carrier: end}) - adjacent_pairs(robot)
-            touching |= {tuple(sorted(pair)) for pair in found if pair <= still}
     for name, arm in parts.items():
         touching |= {tuple(sorted(pair)) for pair in itertools.pairwise(arm["fingers"])}
         if arm["finger_joint"]:
@@ -364,6 +363,14 @@ def _first_semantics(robot: RobotDescription, parts: Mapping[str, Mapping[str, A
     gripper = ends if any(ends.values()) else {}
     pairs = [list(pair) for pair in sorted(touching)]
     return {"postures": {"home": zero, "zero": zero}, "gripper": gripper, "may_touch": pairs}
+
+
+def _mostly_touching(robot: RobotDescription, parts: Mapping[str, Mapping[str, Any]]) -> set[frozenset[str]]:
+    """Pairs of links that touch in nearly all states, be it only where a lift is at an end."""
+    contacts, carried = LinkContacts(robot), [robot.joints[joint] for joint in lift(robot, parts)]
+    states = [{}, *({joint.name: end} for joint in carried for end in (joint.lower, joint.upper))]
+    found = set[frozenset[str]]().union(*(contacts.always_touching(_MOSTLY, held) for held in states))
+    return found - contacts.always_touching() - adjacent_pairs(robot)
 
 
 def _free_home(

@@ -17,9 +17,10 @@ from openarm_bringup.commands import hardware as commands
 from openarm_bringup.doctor.hardware import check_motors
 from openarm_common.errors import Code
 from openarm_common.motors.bus import Bus, Frame
+from openarm_common.motors.frames import Register, read_register, register_reply
 from openarm_common.motors.wiring import ArmWiring, Wiring, axes_of, load_wiring
 from openarm_common.robot.description import RobotDescription
-from openarm_hardware import scan
+from openarm_hardware import scan, upkeep
 from openarm_hardware.arm import Phase
 from openarm_hardware.client import check_load
 from openarm_hardware.scan import scanned, unset
@@ -64,6 +65,49 @@ def test_all_motors_of_two_arms_on_one_bus_are_found_and_come_up(rig: Callable[.
     state = bench.until(servo, lambda state: state.phases == (Phase.HELD, Phase.DAMPED))
     assert "two_finger (motor 0x10" in state.text
     assert "over voltage or under voltage" in state.text
+
+
+class Wire(Bus):
+    """A bus on which each question comes back with answers; what another process asks on it is seen too."""
+
+    def __init__(self, answers: Callable[[int], list[int]], foreign: Sequence[Frame] = ()) -> None:
+        super().__init__("wire")
+        self._answers, self._waiting = answers, list(foreign)
+
+    def receive(self) -> list[Frame]:
+        came, self._waiting = self._waiting, []
+        return came
+
+    def send(self, frames: Sequence[Frame]) -> int:
+        for _, (motor, _, _, register, *_) in frames:
+            reply = register_reply(motor, register, 1.0, written=False)
+            self._waiting += [(number, reply) for number in self._answers(motor)]
+        return len(frames)
+
+    def close(self) -> None:
+        pass
+
+
+def test_two_motors_of_one_id_are_named_and_given_no_other_id(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    numbers = {3: [0x13, 0x13], 5: [0x15, 0], 6: [0x16], 200: [0]}
+    monkeypatch.setattr(scan, "open_bus", lambda *_, **__: Wire(lambda motor: numbers.get(motor, [])))
+    found = scanned(["unix:x"], wired())
+    assert [(motor.id, motor.reply_id) for motor in found] == [(3, 19), (3, 19), (5, 0), (5, 21), (6, 22), (200, 0)]
+    three, five, far = unset(found, wired())
+    assert three == (
+        "2 motors answer to id 3 on unix:x; connect one of them alone and type"
+        " `openarm hardware set-id unix:x 3 --to 1`, or another id"
+    )
+    assert five.startswith("2 motors answer to id 5 on unix:x; ")
+    assert far.endswith("type `openarm hardware set-id unix:x 200 --to ID`")
+    monkeypatch.setattr(upkeep, "open_bus", lambda *_, **__: Wire(lambda motor: numbers.get(motor, [])))
+    refused("2 motors answer to id 3 on unix:", set_id, f"unix:{tmp_path}/x", 3, 9, 0x10, flexible=True)
+
+
+def test_questions_of_another_process_are_no_motors() -> None:
+    asks = [read_register(motor, Register.MST_ID) for motor in (3, 9)]
+    # both processes have asked motor 3, which has answered both
+    assert scan.answering(Wire(lambda motor: [0x13, 0x13] if motor == 3 else [], asks)) == [(3, 0x13)]
 
 
 def test_motors_fresh_from_the_factory_are_named_and_set_up(rig: Callable[..., Rig]) -> None:

@@ -270,7 +270,8 @@ def test_a_check_names_links_that_touch_in_a_posture_or_always(folder):
     broken(folder, 'link1="right_f1" link2="right_f2"', 'link1="right_1" link2="right_f2"')
     broken(folder, '<origin xyz="-0.02 0 0.2"', '<origin xyz="0.02 0 0.2"', "two.urdf")
     faults = folder_faults(folder)
-    assert any(re.match("posture 'home'.*: right_f1 and right_f2 touch; give another one in semantics.yaml, ", f) for f in faults)
+    words = "posture 'home'.*: right_f1 and right_f2 touch; give another one in semantics.yaml, "
+    assert any(re.match(words, fault) for fault in faults)
     assert "right_f1 and right_f2 touch in every random state, and the SRDF does not allow it" in faults
     assert not any("left_f1 and left_f2" in f for f in faults)
 
