@@ -20,6 +20,7 @@ from openarm_grasp import warm as grasp
 from openarm_motion import warm as motion
 from openarm_octomap import warm as octomap
 from openarm_perception import warm as perception
+from openarm_world import warm as world
 
 
 def warm_hardware() -> None:
@@ -29,7 +30,9 @@ def warm_hardware() -> None:
 
 
 #: What nodes run in their executor, and the rest; the dearest first.
-OF_NODES = (octomap.warm, motion.warm_collision, grasp.warm, motion.warm_kinematics, perception.warm, warm_hardware)
+OF_NODES = (
+    octomap.warm, motion.warm_collision, grasp.warm, motion.warm_kinematics, perception.warm, warm_hardware, world.warm,
+)  # fmt: skip
 REST = (calibration.warm,)
 
 

@@ -20,7 +20,7 @@ MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 #: These orchestrate processes and measure the whole: they may import any package.
 OUTER = ("openarm_bringup", "openarm_evaluation")
 #: These are libraries: the others may import them, and each of them those before it.
-INNER = ("openarm_common", "openarm_control")
+INNER = ("openarm_common", "openarm_world", "openarm_control")
 #: Modules of the longest import chain that a package may have.
 LONGEST = 10
 #: rosdep keys of what Ubuntu packages.

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one question on an object: moved so, how many of its points are seen, seen through, or hidden?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.camera.depth_view import DepthImage, DepthView
+from openarm_common.kernels import kernel
+from openarm_common.types import Array
+from openarm_world.config import WorldConfig
+
+#: States of points.
+SEEN, FREE, HIDDEN = np.int8(1), np.int8(-1), np.int8(0)
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares of the points of an object; their sum is 1.
+
+    Attributes:
+        seen: Depth ends at them.
+        free: Depth ends behind them: the camera sees through.
+        hidden: Depth ends in front of them, or is not measured, or they are out of the image.
+    """
+
+    seen: float
+    free: float
+    hidden: float
+
+    @property
+    def in_view(self) -> float:
+        """Share of the points that says anything."""
+        return self.seen + self.free
+
+    @property
+    def left(self) -> float:
+        """Share of those in view that is not where it should be; 0 when none is in view."""
+        return self.free / self.in_view if self.in_view else 0.0
+
+
+def explain(points: Array, T_motion: Array, view: DepthView, config: WorldConfig = WorldConfig()) -> Shares:  # noqa: B008 - frozen
+    """Ask where the points of an object are that has moved.
+
+    Args:
+        points: (n, 3) on its surface, where it was, base frame, m.
+        T_motion: (4, 4) how it has moved since, in the base frame; the identity: it stands.
+        view: Depth without the noise of single pixels.
+        config: What counts as seen.
+    """
+    state = look(points, T_motion, view, config)
+    n = max(len(state), 1)
+    seen, free = np.count_nonzero(state == SEEN) / n, np.count_nonzero(state == FREE) / n
+    return Shares(seen, free, 1.0 - seen - free)
+
+
+def look(points: Array, T_motion: Array, view: DepthView, config: WorldConfig) -> NDArray[np.int8]:
+    """Return the state (n,) of each point, SEEN, FREE or HIDDEN; arguments as `explain`."""
+    T, lens = se3.inverse(view.T_base_camera) @ T_motion, view.intrinsics
+    pinhole = np.array([lens.fx, lens.fy, lens.cx, lens.cy])
+    state = np.empty(len(points), np.int8)
+    points = np.ascontiguousarray(points, np.float64)
+    _look(points, T, view.depth, view.scale, pinhole, config.noise, config.least_noise, state)
+    return state
+
+
+@kernel
+def _look(
+    points: Array,
+    T: Array,
+    depth: DepthImage,
+    scale: np.float32,
+    pinhole: Array,
+    noise: float,
+    least: float,
+    state: NDArray[np.int8],
+) -> None:
+    """Judge each point by the 3 x 3 pixels about its own: it is rounded to one of them, and surfaces slope."""
+    height, width = depth.shape
+    fx, fy, cx, cy = pinhole
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        d = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        state[i] = 0
+        if d <= 0.0:
+            continue
+        u = int(np.floor((T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / d * fx + cx + 0.5))
+        v = int(np.floor((T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / d * fy + cy + 0.5))
+        if not (1 <= u < width - 1 and 1 <= v < height - 1):
+            continue
+        within = max(noise * d * d, least)
+        behind, nearer, at = False, False, False
+        for a in range(v - 1, v + 2):
+            for b in range(u - 1, u + 2):
+                measured = depth[a, b] * scale
+                if not measured > 0.0:  # nor NaN
+                    continue
+                off = measured - d
+                behind |= off > within
+                nearer |= off < -within
+                at |= abs(off) <= within
+        state[i] = 1 if at else -1 if behind and not nearer else 0
