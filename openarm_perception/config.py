@@ -21,6 +21,7 @@ from openarm_perception.detection.tags import TagConfig
 from openarm_perception.geometry.filters import FilterConfig
 from openarm_perception.geometry.watch import WatchConfig
 from openarm_perception.stereo.matching import StereoConfig
+from openarm_world.config import WorldConfig
 
 
 class DetectNodeConfig(Config):
@@ -67,6 +68,7 @@ class DetectNodeConfig(Config):
     localizer: LocalizerConfig = Field(default_factory=LocalizerConfig)
     self_filter: RobotConfig = RobotConfig()
     watch: WatchConfig = WatchConfig()
+    objects: WorldConfig = WorldConfig()
     faults: DetectionFaults = DetectionFaults()
 
     def table_top_z(self) -> float:

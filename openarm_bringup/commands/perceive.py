@@ -23,6 +23,7 @@ def perceive(
     depth: str = "",
     camera: str = "",
     start: float = 0.0,
+    frames: int = 1,
     out: Path | None = None,
     depth_scale: float | None = None,
     rectified: Literal["auto", "yes", "no"] = "auto",
@@ -52,6 +53,8 @@ def perceive(
         camera: Namespace of the camera in a bag or graph, such as /camera/camera, or a part of it; the only one when
             not given.
         start: Start in a bag: only from this long after its first message on, s.
+        frames: Number of frames of a bag, of a camera that stands still, 15 a second at most: objects have ids across
+            them. Table and pictures are those of the last one.
         out: Folder for pictures, the label image and a page.
         depth_scale: Metres of a count of depth, of every encoding: 0.0001 for a D405, 0.0002 for TUM, 0.001 for floats
             in mm; 0.001 for integers and 1 for floats when not given.
@@ -76,28 +79,32 @@ def perceive(
     from openarm_common.resources import config_dir
     from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
     from openarm_perception.frames.clouds import is_cloud, read_cloud
-    from openarm_perception.frames.found import find
+    from openarm_perception.frames.found import find, followed
     from openarm_perception.frames.images import is_depth, read_depth, read_frame, read_pose
     from openarm_perception.geometry.depth import UNLIMITED, DepthLimits
+    from openarm_world import Objects
 
     if not 0.0 < near < far <= 1000.0:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"--near {near:g} and --far {far:g} m; expected 0 < near < far <= 1000"
         )
     limits = DepthLimits(near=near, far=far)
+    first_ns, sequence = 0, iter(())
     for file in files:
         if not file.exists():
             raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no file or bag {file}")
     cloud = None
     bag = len(files) == 1 and not is_cloud(files[0]) and (files[0].is_dir() or is_recording(files[0]))
     of_topics = bag or not files
+    if frames < 1 or (frames > 1 and not bag):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--frames {frames}: expected 1, or more of a bag")
     if not of_topics and (color or depth or camera or (rectified, registered) != ("auto", "auto")):
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             "--color, --depth, --camera, --rectified and --registered are for topics of a bag or of the running graph",
         )
     if of_topics:
-        from openarm_bringup.ros.camera_frame import frame_of_bag, frame_of_graph
+        from openarm_bringup.ros.camera_frame import frame_of_graph, frames_of_bag
         from openarm_perception.ros.frames import CameraChoice
 
         lens = read_lens(Path(info)) if info and Path(info).is_file() else None
@@ -105,7 +112,11 @@ def perceive(
         chosen = CameraChoice(camera, color, depth, topic, lens, depth_scale, rectified, registered)
         if not bag:
             join_graph(domain)
-        frame = frame_of_bag(files[0], chosen, start) if bag else frame_of_graph(chosen, timeout)
+        if bag:
+            sequence = frames_of_bag(files[0], chosen, start, frames)
+            first_ns, frame = next(sequence)
+        else:
+            frame = frame_of_graph(chosen, timeout)
     elif len(files) == 1 and is_cloud(files[0]):
         if info:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{files[0]} is a cloud, which needs no --info")
@@ -133,7 +144,18 @@ def perceive(
         except OSError as error:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"--out {out} is no folder to write to: {error}") from error
     colors = ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
-    found = find(frame, limits, colors, T_base_camera, empty)
+    found, objects, seen = find(frame, limits, colors, T_base_camera, empty), Objects(), list[dict[str, object]]()
+    if frames > 1:
+        objects, found = followed(objects, found, first_ns)
+        seen.append(found.as_seen(0.0))
+    for t_ns, later in sequence:
+        t = (t_ns - first_ns) * 1e-9
+        try:
+            objects, found = followed(objects, find(later, limits, colors, T_base_camera, empty), t_ns)
+        except OpenArmError as error:  # something in front of the camera hides the table
+            seen.append({"t": round(t, 3), "clusters": [], "message": error.message})
+        else:
+            seen.append(found.as_seen(t))
     written = () if out is None else found.write(out)
     count = len(found.segmentation.clusters)
     first, last = found.depths
@@ -152,6 +174,9 @@ def perceive(
     if out is not None:
         message += f"; the page is {out / 'index.html'}"
     data = {**found.as_json(), "written": [str(path) for path in written]}
+    if seen:
+        message += f"; {objects.next_id - 1} objects in {len(seen)} frames"
+        data["frames"] = seen
     return Outcome(True, message, data=data, text=_table(found.rows()))
 
 
@@ -160,7 +185,7 @@ def _table(rows: list[tuple[str, ...]]) -> str:
     from rich.text import Text
 
     table = Table(box=None, pad_edge=False)
-    for name in ("#", "colour", "shape", "edges [mm]", "± [mm]", "x y z [m]", "pixels", "why it is no prism"):
+    for name in ("#", "object", "colour", "shape", "edges [mm]", "± [mm]", "x y z [m]", "pixels", "why it is no prism"):
         table.add_column(Text(name), no_wrap=True)  # as a string, [mm] would be markup
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))

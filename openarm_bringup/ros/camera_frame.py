@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ from openarm_common.ros.node import QOS_STATIC_TF
 from openarm_perception.frames.images import Frame
 from openarm_perception.geometry.depth import UNLIMITED
 from openarm_perception.ros.frames import CameraChoice, CameraTopics, FrameBuilder, camera_topics
+
+#: Frames of a bag that are nearer in time are passed over, ns.
+_PERIOD_NS = 60_000_000
 
 
 class _Camera(ContextNode):
@@ -80,13 +84,14 @@ def frame_of_graph(chosen: CameraChoice, timeout: float) -> Frame:
         return listener.frame(chosen, timeout)
 
 
-def frame_of_bag(path: Path, chosen: CameraChoice, start_s: float) -> Frame:
-    """Return the first frame of a camera in a bag.
+def frames_of_bag(path: Path, chosen: CameraChoice, start_s: float, count: int = 1) -> Iterator[tuple[int, Frame]]:
+    """Give frames of a camera in a bag, with the times they were recorded at, ns; one at least, at 15 Hz at most.
 
     Args:
         path: Folder of rosbag2, or a file of it.
         chosen: Which camera.
         start_s: Only from this long after the first message on.
+        count: Most frames.
 
     Raises:
         OpenArmError: NOTHING_DETECTED or INVALID_ARGUMENT, as `camera_topics`, for what is no bag, or when it has no
@@ -104,14 +109,17 @@ def frame_of_bag(path: Path, chosen: CameraChoice, start_s: float) -> Frame:
                 for record in bag.records([info]):
                     builder.take(record.topic, message_of(bag, record))
                     break
+            given, last_ns = 0, -_PERIOD_NS
             for record in bag.records([topic for topic in topics if topic], start_s):
                 try:
                     frame = builder.take(record.topic, message_of(bag, record))
                 except OpenArmError as error:
                     builder.faults.append(error)
                     frame = None
-                if frame is not None:
-                    return frame
-                if builder.given_up:
+                if frame is not None and record.t_ns - last_ns >= _PERIOD_NS:
+                    yield record.t_ns, frame
+                    given, last_ns = given + 1, record.t_ns
+                if given >= count or builder.given_up:
                     break
-    raise builder.failure(Code.INVALID_ARGUMENT, f"{path} has no frame from {start_s:g} s on")
+    if not given:
+        raise builder.failure(Code.INVALID_ARGUMENT, f"{path} has no frame from {start_s:g} s on")

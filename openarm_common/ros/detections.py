@@ -2,19 +2,15 @@
 """Detections to and from vision_msgs/Detection3DArray: all that is known of /detections_3d is here.
 
 The hypotheses of an object are its attributes: name, colour, shape, wider shape, those that are known, all of the same
-score; the label comes first. Its id says which is which: `name/colour/shape`, where % / and # are percent-encoded, and
-`#2` from the second object on that is described alike. A message of another detector needs no such id: of its classes
-those that name a shape are the shape, the best of the others the name, the next the colour. An object that was detected
-but not measured has a negative covariance[0] (-1 is the mark of ROS for an unknown value), which says why; its box
-encloses its visible part.
+score; the label comes first. Of the classes of a message those that name a shape are the shape (the narrower one, such
+as cube of box and cube), the best of the others the name, the next the colour: where an object has one of both, it is
+read as the name. An object has the same id in all images that show it. One that was detected but not measured has a
+negative covariance[0] (-1 is the mark of ROS for an unknown value), which says why; its box encloses its visible part.
 """
 
 from __future__ import annotations
 
-import re
-from collections import Counter
 from collections.abc import Sequence
-from urllib.parse import unquote
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovariance
@@ -26,7 +22,7 @@ from vision_msgs.msg import (
     ObjectHypothesisWithPose,
 )
 
-from openarm_common.detection import KINDS, Described, Detection
+from openarm_common.detection import KINDS, WIDER, Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import brief, check_length
 from openarm_common.ros.convert import header, matrix_to_pose, pose_to_matrix, vector, xyz
@@ -54,14 +50,14 @@ def detections_to_msg(
         t_ns: Stamp of the image.
     """
     message = Detection3DArray(header=header(frame_id, t_ns))
-    for name, detection, covariance in zip(ids(detections), detections, covariances, strict=True):
+    for detection, covariance in zip(detections, covariances, strict=True):
         pose = matrix_to_pose(detection.T_base_object)
         uncertain = PoseWithCovariance(pose=pose, covariance=covariance.ravel())
         if not detection.measured:
             uncertain.covariance[0] = _MARKS.get(detection.code, UNKNOWN)
         results = [hypothesis(each, detection.score, uncertain) for each in detection.attributes]
         box = BoundingBox3D(center=pose, size=vector(detection.size))
-        message.detections.append(Detection3D(header=message.header, results=results, bbox=box, id=name))
+        message.detections.append(Detection3D(header=message.header, results=results, bbox=box, id=detection.id))
     return message
 
 
@@ -80,14 +76,14 @@ def detections_from_msg(message: Detection3DArray) -> tuple[Detection, ...]:
         result = max(item.results, key=lambda result: result.hypothesis.score)
         best, variance = result.hypothesis, result.pose.covariance[0]
         others = [r.hypothesis.class_id for r in item.results if r.hypothesis.class_id != best.class_id]
-        name, color, kind = _attributes(item.id, [best.class_id, *others])
+        name, color, kind = _attributes([best.class_id, *others])
         T, size = pose_to_matrix(item.bbox.center), np.asarray(xyz(item.bbox.size))
         if not ((size >= 0.0) & (size <= _LARGEST)).all() or not np.isfinite([best.score, variance]).all():
             text = f"{size.tolist()} m, score {best.score:g}, covariance {variance:g}"
             raise OpenArmError(Code.INVALID_ARGUMENT, f"detection {brief(name)} has the size {text}")
         is_round = kind in _ROUND and abs(float(size[0] - size[1])) < _AS_LONG_AS_WIDE
         code = _REASONS.get(variance, Code.NOTHING_DETECTED)
-        out.append(Detection(name, best.score, T, size, is_round, kind, variance >= 0.0, code, color))
+        out.append(Detection(name, best.score, T, size, is_round, kind, variance >= 0.0, code, color, item.id))
     return tuple(out)
 
 
@@ -104,21 +100,8 @@ def hypothesis(name: str, score: float, pose: PoseWithCovariance | None = None) 
     )
 
 
-def ids(detections: Sequence[Described]) -> list[str]:
-    """Return an id for each: its name, colour and shape, and a number from the second of such on."""
-    counts, out = Counter[str](), list[str]()
-    for one in detections:
-        parts = (re.sub("[%/#]", lambda m: f"%{ord(m[0]):02X}", part) for part in (one.name, one.color, one.kind))
-        text = "/".join(parts)
-        counts[text] += 1
-        out.append(text if counts[text] == 1 else f"{text}#{counts[text]}")
-    return out
-
-
-def _attributes(text: str, classes: Sequence[str]) -> tuple[str, str, str]:
-    """Return name, colour and shape: as the id says where it speaks of these classes, else by what the classes are."""
-    parts = [unquote(part) for part in text.partition("#")[0].split("/")]
-    if len(parts) == 3 and any(parts) and {*parts} - {""} <= {*classes}:
-        return parts[0], parts[1], parts[2]
+def _attributes(classes: Sequence[str]) -> tuple[str, str, str]:
+    """Return name, colour and shape by what classes are, the best first."""
     name, color, *_ = (*(each for each in classes if each not in KINDS), "", "")
-    return name, color, next((each for each in classes if each in KINDS), "")
+    kind = next((each for each in classes if each in KINDS), "")
+    return name, color, next((each for each in classes if WIDER.get(each) == kind), kind)

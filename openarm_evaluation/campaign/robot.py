@@ -25,6 +25,7 @@ from openarm_common.camera.depth_view import DepthView
 from openarm_common.camera.housings import mounted
 from openarm_common.config import Config, load_config
 from openarm_common.errors import OpenArmError
+from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import per_robot
@@ -50,7 +51,7 @@ from openarm_motion.service.robot import Outcome
 from openarm_motion.timing.trajectory import Motion
 from openarm_octomap.grid import DepthScan
 from openarm_octomap.mapper import Frame as MapFrame
-from openarm_perception.detection.clouds import labelled_cloud
+from openarm_perception.detection.clouds import labelled_cloud, smooth_depth
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer
@@ -63,6 +64,8 @@ from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.stage import Stage
+from openarm_world.carried import carriers
+from openarm_world.objects import Objects, Sight
 
 T = TypeVar("T")
 
@@ -188,6 +191,8 @@ class SimRobot:
         self.frames: deque[Frame] = deque(maxlen=64)
         #: What the hands hold, as the planner believes; the detector takes it for a part of the robot.
         self.held: tuple[HeldBox, ...] = ()
+        #: What the detector of each camera follows.
+        self._objects = {name: Objects(one.objects) for name, one in suite.detectors.items()}
         self._observing = ""
         self._detected_ns = -(10**12)
         self.table = table or scene.table
@@ -336,8 +341,21 @@ class SimRobot:
             )
         except OpenArmError:
             return None  # as the detector: the frame is skipped, the next may do
-        cloud = labelled_cloud(seen, perceived.boxes, DepthLimits(near=camera.near, far=camera.far))
-        return Frame(stamp_ns, perceived.boxes, cloud.moved(T_base_camera))
+        limits = DepthLimits(near=camera.near, far=camera.far)
+        smooth = smooth_depth(seen, limits)
+        cloud = labelled_cloud(seen, smooth, perceived.boxes, limits).moved(T_base_camera)
+        sight = self._follow(name, stamp_ns, DepthView(smooth, optics, T_base_camera, limits.near, limits.far), cloud)
+        return Frame(stamp_ns, perceived.identified(sight.ids).boxes, cloud)
+
+    def _follow(self, name: str, stamp_ns: int, view: DepthView, cloud: LabelledCloud) -> Sight:
+        """Follow the objects of a camera, as its detector does."""
+        try:
+            joints = self.states.joints_at(min(stamp_ns, self.states.latest()[0]))
+            held = carriers(self.description, joints, self.held)
+        except OpenArmError:
+            held = None
+        self._objects[name], sight = self._objects[name].update(view, cloud, stamp_ns, held)
+        return sight
 
     def _watch(self, name: str) -> CameraWatch:
         camera = self.cameras[name]

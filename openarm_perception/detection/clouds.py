@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_common.camera.depth_view import DepthView
+from openarm_common.camera.depth_view import DepthView, unit_scale
 from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
 from openarm_common.labelled_cloud import LabelledCloud
+from openarm_common.types import Floats
 from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.geometry.depth import Deprojector, DepthLimits, View
 from openarm_perception.geometry.patch import denoise, keep_edges
@@ -21,8 +22,17 @@ _AROUND = 0.15
 _SPARSE, _FAR = 2, 4
 
 
+def smooth_depth(view: View, limits: DepthLimits) -> Floats:
+    """Return the depth (h, w) of an image without the noise of single pixels, m; NaN where none counts."""
+    z = view.depth.astype(np.float32) * np.float32(unit_scale(view.depth))
+    z = np.where((z >= limits.near) & (z <= limits.far), z, np.float32(np.nan))
+    pixel = 2.0 / (view.intrinsics.fx + view.intrinsics.fy)
+    return keep_edges(z, *denoise(z, pixel), pixel).astype(np.float32)
+
+
 def labelled_cloud(
     view: View,
+    smooth: Floats,
     boxes: Sequence[LocatedObject],
     limits: DepthLimits,
     flying: FlyingConfig = FlyingConfig(),  # noqa: B008 - frozen
@@ -33,6 +43,7 @@ def labelled_cloud(
 
     Args:
         view: The image.
+        smooth: (h, w) its depth as of `smooth_depth`.
         boxes: What was detected in it; the i-th has label i, counted from 1.
         limits: Depths that count.
         flying: Which pixels float.
@@ -52,11 +63,7 @@ def labelled_cloud(
     floats = np.zeros(label.shape, np.uint8)
     if flying.enabled:
         label_flying(scan, flying, floats)
-    z = view.depth.astype(np.float32) * np.float32(scan.scale)
-    z = np.where((z >= limits.near) & (z <= limits.far), z, np.float32(np.nan))
-    pixel = 2.0 / (view.intrinsics.fx + view.intrinsics.fy)
-    z = keep_edges(z, *denoise(z, pixel), pixel)
-    points = Deprojector(limits).organised(z.astype(np.float32), view.intrinsics)
+    points = Deprojector(limits).organised(smooth, view.intrinsics)
     kept &= (floats == 0) & np.isfinite(points[..., 2])
     return LabelledCloud(points[kept], label[kept], np.zeros(3))
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from openarm_common.config import Config
-from openarm_common.detection import Described
+from openarm_common.detection import KINDS, Described
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Mask
 
@@ -94,6 +94,13 @@ class ColorClass(Config):
     hue_deg: tuple[float, float] = Field(description="from, to, degrees 0..360; from > to wraps through 0 (red)")
     saturation: tuple[float, float] = Field(default=(0.45, 1.0), description="from, to, 0..1")
     value: tuple[float, float] = Field(default=(0.12, 1.0), description="from, to, 0..1; the lower end bounds shadow")
+
+    @field_validator("label")
+    @classmethod
+    def _no_shape(cls, value: str) -> str:
+        if value in KINDS:
+            raise ValueError(f"{value!r} names a shape; expected the name of a colour")
+        return value
 
     @field_validator("hue_deg")
     @classmethod

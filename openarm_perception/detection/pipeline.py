@@ -10,6 +10,7 @@ whichever detector found it. The class of a network is its name, or its shape wh
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -71,6 +72,12 @@ class Perceived:
     def boxes(self) -> tuple[LocatedObject, ...]:
         """All objects, those that could be measured first."""
         return (*self.located, *self.unmeasured)
+
+    def identified(self, ids: Mapping[int, str]) -> Perceived:
+        """Return the same with the ids of objects: of the i-th of `boxes`, counted from 1; a missing one has none."""
+        named = [replace(place, id=ids.get(i, "")) for i, place in enumerate(self.boxes, start=1)]
+        n = len(self.located)
+        return replace(self, located=tuple(named[:n]), unmeasured=tuple(named[n:]))
 
 
 @dataclass(eq=False)

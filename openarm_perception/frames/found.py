@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from openarm_common.camera.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.figures import data_uri, render_page
+from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_perception.detection.detector import ColorDetector, Detection2D
 from openarm_perception.frames.images import Frame
-from openarm_perception.geometry.depth import DepthLimits, Points
+from openarm_perception.geometry.depth import UNLIMITED, DepthLimits, Points
+from openarm_perception.geometry.patch import denoise, keep_edges
 from openarm_perception.segmentation.clusters import Cluster, Segmentation, segment
 from openarm_perception.segmentation.divide import SegmentationConfig
 from openarm_perception.segmentation.draw import depth_picture, label_picture, overlay
+from openarm_world.objects import Objects
 
 #: Points that are asked whether they lie below the support, and so deep, m.
 _ASKED, _BELOW = 20_000, 0.02
@@ -44,14 +49,22 @@ class Found:
         segmentation: Things in depth.
         detections: Things in colour.
         colors: Name of the colour of each cluster; empty where it has none of the palette.
-        placed: Whether the pose of the camera is known: points are in the base frame then, else in the optical one.
+        T_base_camera: (4, 4), where the pose of the camera is known: points are in the base frame then, else in the
+            optical one.
+        ids: Id of the object of each cluster, by its number; none where only one frame was taken.
     """
 
     frame: Frame
     segmentation: Segmentation
     detections: tuple[Detection2D, ...]
     colors: tuple[str, ...]
-    placed: bool
+    T_base_camera: Array | None
+    ids: Mapping[int, str] = field(default_factory=dict[int, str])
+
+    @property
+    def placed(self) -> bool:
+        """Whether the pose of the camera is known."""
+        return self.T_base_camera is not None
 
     def cluster_of(self, found: Detection2D) -> int:
         """Return the number of the cluster that has most pixels of a detection; 0: none has half of them."""
@@ -117,9 +130,7 @@ class Found:
                 "normal": [round(float(v), 5) for v in support.normal], "offset": round(support.offset, 5),
                 "noise_at_1m": round(support.noise, 6), "share": round(support.share, 4),
             },
-            "clusters": [
-                self._cluster(one, color) for one, color in zip(self.segmentation.clusters, self.colors, strict=True)
-            ],
+            "clusters": self._clusters(),
             "detections": [
                 {
                     "label": one.label, "score": round(one.score, 4), "centre": list(one.centre),
@@ -129,9 +140,18 @@ class Found:
             ],
         }  # fmt: skip
 
+    def as_seen(self, t: float) -> dict[str, object]:
+        """Return the clusters of the frame of a sequence, t s after its first one."""
+        return {"t": round(t, 3), "clusters": self._clusters()}
+
+    def _clusters(self) -> list[dict[str, Any]]:
+        named = zip(self.segmentation.clusters, self.colors, strict=True)
+        return [self._cluster(one, color) for one, color in named]
+
     def _cluster(self, one: Cluster, color: str) -> dict[str, Any]:
         return {
-            "id": one.id, "pixels": one.pixels, "centre": [round(float(v), 5) for v in one.T_frame_box[:3, 3]],
+            "id": one.id, "object": self.ids.get(one.id, ""), "pixels": one.pixels,
+            "centre": [round(float(v), 5) for v in one.T_frame_box[:3, 3]],
             "size": [round(float(v), 5) for v in one.size], "known_to": round(self.known_to(one), 5),
             "shape": one.shape.kind, "why": one.shape.why,
             "color": color, "rgb": None if one.color is None else list(one.color),
@@ -139,13 +159,14 @@ class Found:
         }  # fmt: skip
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return a row of text for each cluster: number, colour, shape, edges, to what, place, pixels, remarks."""
+        """Return a row of text for each cluster: number, object, colour, shape, edges, to what, place, pixels, why."""
         out: list[tuple[str, ...]] = []
         for one, color in zip(self.segmentation.clusters, self.colors, strict=True):
             edges = " x ".join(f"{edge * 1e3:.0f}" for edge in one.size)
             place = " ".join(f"{v:+.3f}" for v in one.T_frame_box[:3, 3])
-            exact = f"{max(1.0, self.known_to(one) * 1e3):.0f}"
-            out.append((str(one.id), color, one.shape.kind, edges, exact, place, str(one.pixels), one.shape.why))
+            exact, thing = f"{max(1.0, self.known_to(one) * 1e3):.0f}", self.ids.get(one.id, "")
+            row = (str(one.id), thing, color, one.shape.kind, edges, exact, place, str(one.pixels), one.shape.why)
+            out.append(row)
         return out
 
     def write(self, folder: Path) -> tuple[Path, ...]:
@@ -210,10 +231,30 @@ def find(
         raise OpenArmError(error.code, "; ".join([error.message, *filter(None, hints)])) from error
     rgb = frame.rgb
     if rgb is None:
-        return Found(frame, result, (), ("",) * len(result.clusters), T_base_camera is not None)
+        return Found(frame, result, (), ("",) * len(result.clusters), T_base_camera)
     named = [colors.name(np.ascontiguousarray(rgb[one.window]), one.mask) for one in result.clusters]
     names = tuple(name if share >= _COLORED else "" for name, share in named)
-    return Found(frame, result, colors.detect(rgb), names, T_base_camera is not None)
+    return Found(frame, result, colors.detect(rgb), names, T_base_camera)
+
+
+def followed(objects: Objects, found: Found, t_ns: int) -> tuple[Objects, Found]:
+    """Return objects after a frame of a camera that stands still, and the frame with their ids.
+
+    Args:
+        objects: After the frame before.
+        found: In the frame.
+        t_ns: Its stamp.
+    """
+    T = np.eye(4) if found.T_base_camera is None else found.T_base_camera
+    z, lens = found.frame.points[..., 2], found.frame.intrinsics
+    pixel = 2.0 / (lens.fx + lens.fy)
+    smooth = keep_edges(z, *denoise(z, pixel), pixel).astype(np.float32)
+    every = found.segmentation.clusters
+    points = np.concatenate([np.empty((0, 3), np.float32), *(one.points for one in every)])
+    labels = np.repeat(np.array([one.id for one in every], np.uint32), [len(one.points) for one in every])
+    view = DepthView(smooth, lens, T, UNLIMITED.near, UNLIMITED.far)
+    objects, sight = objects.update(view, LabelledCloud(points, labels, T[:3, 3]), t_ns)
+    return objects, replace(found, ids=sight.ids)
 
 
 def _within(points: Points, limits: DepthLimits) -> Points:

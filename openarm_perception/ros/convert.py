@@ -14,8 +14,7 @@ from vision_msgs.msg import Detection2D as Detection2DMsg
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.ros.convert import header, matrix_to_pose, vector
-from openarm_common.ros.detections import hypothesis, ids
-from openarm_perception.detection.detector import Detection2D
+from openarm_common.ros.detections import hypothesis
 from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.detection.pipeline import Perceived
 
@@ -23,19 +22,21 @@ from openarm_perception.detection.pipeline import Perceived
 MARKER_LIFETIME = 2.0
 
 
-def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Detection2DArray:
+def detections_2d(perceived: Perceived, frame_id: str, t_ns: int) -> Detection2DArray:
     """Boxes by their centre, pixels; a box in an image has no pose, and no shape but that which a network knows.
 
     Args:
-        found: In the image.
+        perceived: What was found in the image; what is not in space either has no id.
         frame_id: Frame of the image.
         t_ns: Stamp.
     """
     message = Detection2DArray(header=header(frame_id, t_ns))
-    for name, detection in zip(ids(found), found, strict=True):
+    ids = {id(place.source): place.id for place in perceived.boxes}
+    for detection in perceived.found:
         box = BoundingBox2D(size_x=float(detection.size[0]), size_y=float(detection.size[1]))
         box.center.position.x, box.center.position.y = detection.centre
         results = [hypothesis(attribute, detection.score) for attribute in detection.attributes]
+        name = ids.get(id(detection), "")
         message.detections.append(Detection2DMsg(header=message.header, results=results, bbox=box, id=name))
     return message
 
@@ -74,7 +75,7 @@ def markers(located: Sequence[LocatedObject], frame_id: str, t_ns: int) -> Marke
         body.color = ColorRGBA(r=0.2, g=0.9, b=0.9, a=0.45)
         text = Marker(header=header(frame_id, t_ns), ns="labels", id=i, lifetime=lifetime)
         text.type = Marker.TEXT_VIEW_FACING
-        text.text = f"{detection.label} {detection.score:.2f}"
+        text.text = f"{detection.label} {detection.score:.2f}" + (f" #{detection.id}" if detection.id else "")
         text.pose.position.x, text.pose.position.y = body.pose.position.x, body.pose.position.y
         text.pose.position.z = body.pose.position.z + detection.size[2] / 2.0 + 0.03
         text.scale.z = 0.025

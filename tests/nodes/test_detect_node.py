@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import partial
 
@@ -39,7 +40,7 @@ def test_a_box_is_found_where_it_stands(bench) -> None:
     assert message.header.frame_id == BASE_FRAME
     assert stamp_to_ns(message.header.stamp) % (200 * MS) == 0
     (found,) = message.detections
-    assert found.id == "/red/box"
+    assert found.id == "1"
     assert found.results[0].hypothesis.class_id == "red"
     assert 0.5 < found.results[0].hypothesis.score <= 1.0
     T = pose_to_matrix(found.bbox.center)
@@ -160,7 +161,8 @@ def test_boxes_in_the_image_by_their_centre_and_pictures_and_markers_for_people(
     assert (picture != bench.camera.rgb).any()
     wiped, body, text = markers.got[-1].markers
     assert (wiped.action, body.type, text.type) == (Marker.DELETEALL, Marker.CUBE, Marker.TEXT_VIEW_FACING)
-    assert text.text.startswith("red")
+    assert re.fullmatch(r"red [01]\.\d\d #1", text.text)
+    assert box.id == "1"
 
 
 @pytest.mark.requirement("A-61")

@@ -130,6 +130,17 @@ def test_what_motion_holds_is_no_object_on_the_table(ros) -> None:
     assert len(in_image[-1].detections) == 1
 
 
+def test_what_was_held_has_the_id_that_it_had_before(ros) -> None:
+    bench = detector(ros)
+    bench.pump(lambda: bench.got and bench.got[-1].detections, "a detection")
+    (before,) = bench.got[-1].detections
+    bench.hold()
+    bench.pump(lambda: not bench.got[-1].detections, "it is held")
+    bench.held.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL)]))
+    bench.pump(lambda: bench.got[-1].detections, "it was let go")
+    assert bench.got[-1].detections[0].id == before.id == "1"
+
+
 def test_without_joint_states_objects_are_seen_and_the_lack_is_named(ros) -> None:
     bench = detector(ros, transform_wait=0.2)
     bench.hold()

@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo
 
 from openarm_bringup.bags.bag import BagWriter
 from openarm_bringup.bags.ros.listener import from_profile
-from openarm_bringup.ros.camera_frame import frame_of_bag
+from openarm_bringup.ros.camera_frame import frames_of_bag
 from openarm_calibration.board.board import parse_board
 from openarm_calibration.board.detect import detect_undistorted
 from openarm_common.camera.cameras import Intrinsics
@@ -66,7 +66,7 @@ def by_bag(model: str, rgb: NDArray[np.uint8], folder: Path) -> NDArray[np.uint8
         for topic, message in zip(topics, (array_to_image(rgb, "rgb8", "c", 0), depth, info_of(model)), strict=True):
             bag.add_topic(topic, f"sensor_msgs/msg/{type(message).__name__}", from_profile(QOS_SENSOR))
             bag.write(topic, 0, serialize_message(message))
-    frame = frame_of_bag(folder / "bag", CameraChoice(), 0.0)
+    _, frame = next(frames_of_bag(folder / "bag", CameraChoice(), 0.0))
     assert frame.rgb is not None
     return frame.rgb
 

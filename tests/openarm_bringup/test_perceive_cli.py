@@ -8,9 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rclpy.serialization import serialize_message
 
 from openarm_bringup import cli
+from openarm_bringup.bags.bag import BagWriter
+from openarm_bringup.bags.ros.listener import from_profile
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.ros.convert import info_from_intrinsics
+from openarm_common.ros.images import array_to_image
+from openarm_common.ros.node import QOS_SENSOR
 from openarm_perception.frames.cloud_fields import Cloud
 from openarm_perception.frames.pcd import read_pcd, write_pcd
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
@@ -155,6 +161,7 @@ def test_a_pose_gives_the_base_frame_and_a_background_what_is_new(files, tmp_pat
         (("{c}", "{z}", "--info", "{k}"), 1, "within --near 0.1 and --far 3: type --far 7.4"),
         (("{p}", "--far", "0.5"), 1, "type --far 0.8"),
         (("{k}.pcd",), 2, "there is no file or bag"),
+        (("{c}", "{z}", "--info", "{k}", "--frames", "2"), 2, "--frames 2: expected 1, or more of a bag"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(files, tmp_path, capsys, argv, exit_code, words):
@@ -221,3 +228,43 @@ def test_no_number_of_the_table_is_cut(files, capsys):
 def test_a_folder_that_cannot_be_written_is_named(files, capsys):
     code, answer = answer_of(capsys, "perceive", *files, "--depth-scale", "0.0001", "--out", "/proc/none")
     assert (code, "--out /proc/none is no folder to write to" in str(answer["message"])) == (2, True)
+
+
+def test_objects_have_ids_across_the_frames_of_a_bag(tmp_path, capsys):
+    """Two boxes; one is taken away, something hides the table, and another is put elsewhere."""
+    v, u = np.mgrid[:120, :160]
+    boxes = {"a": (-0.15, 0.0), "b": (0.12, 0.05), "c": (0.1, -0.1)}
+    topics = ("/c/color/image_raw", "/c/depth/image_raw", "/c/color/camera_info")
+    with BagWriter(tmp_path / "bag", {}) as bag:
+        for topic, kind in zip(topics, ("Image", "Image", "CameraInfo"), strict=True):
+            bag.add_topic(topic, f"sensor_msgs/msg/{kind}", from_profile(QOS_SENSOR))
+        for k, there in enumerate(("ab", "ab", "b", "", "bc", "cb")):
+            z = np.full((120, 160), DISTANCE if there else 0.05, np.float32)
+            for x, y in (boxes[name] for name in there):
+                d = DISTANCE - HEIGHT
+                on_x, on_y = (u - LENS.cx) / LENS.fx * d - x, (v - LENS.cy) / LENS.fy * d - y
+                z[(np.abs(on_x) < HALF[0]) & (np.abs(on_y) < HALF[1])] = d
+            t_ns = k * 200_000_000
+            color = array_to_image(np.full((120, 160, 3), 180, np.uint8), "rgb8", "c", t_ns)
+            depth = array_to_image(z, "32FC1", "c", t_ns)
+            info = info_from_intrinsics(LENS, "c", t_ns)
+            for topic, message in zip(topics, (color, depth, info), strict=True):
+                bag.write(topic, t_ns, serialize_message(message))
+    code, answer = answer_of(capsys, "perceive", str(tmp_path / "bag"), "--frames", "9")
+    assert code == 0
+    assert [one["t"] for one in answer["frames"]] == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+    assert "no plane" in answer["frames"][3]["message"]
+    ids = [
+        {name: one["object"] for one in frame["clusters"] for name, at in boxes.items() if near(one["centre"], at)}
+        for frame in answer["frames"]
+    ]
+    a, b = ids[0]["a"], ids[0]["b"]
+    assert ids == [{"a": a, "b": b}, {"a": a, "b": b}, {"b": b}, {}, {"b": b, "c": "3"}, {"b": b, "c": "3"}]
+    assert {a, b} == {"1", "2"}
+    assert "3 objects in 6 frames" in answer["message"]
+    code, answer = answer_of(capsys, "perceive", str(tmp_path / "bag"))
+    assert "frames" not in answer
+
+
+def near(centre: list[float], at: tuple[float, float]) -> bool:
+    return abs(centre[0] - at[0]) < 0.02 and abs(centre[1] - at[1]) < 0.02

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import yaml
 
+from openarm_bringup.cli import run
 from openarm_bringup.supervision.environment import node_arguments
 from openarm_bringup.supervision.graph import load_graph
 from openarm_common.errors import Code
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
+from openarm_grasp.perception.detections import Frame
 from openarm_motion.config import MotionConfig
 from openarm_motion.service.motion_service import MotionService
 from tests.refusals import refused
@@ -34,6 +36,36 @@ def test_the_robot_in_process_has_the_motion_service_and_a_map_that_shows_the_ob
     field.require_fresh(robot.t_ns, 2.0)
     seen = robot.motion.scene_state().map
     assert seen.occupied is not None, seen.why  # it plans with that map
+
+
+def test_the_robot_in_process_follows_objects_as_the_detector_does() -> None:
+    scene = load_scene("demo")
+    robot = SimRobot(scene, SimulatedSenses())
+    ids = list[dict[str, str]]()
+    for _ in range(3):
+        robot.pass_time(0.1)
+        frame = robot.detect("overhead")
+        assert frame is not None
+        ids.append({one.label: one.id for one in frame.detections})
+    assert ids[0] == ids[1] == ids[2]
+    assert set(ids[0].values()) == {str(i + 1) for i in range(len(scene.objects))}
+
+
+@pytest.mark.long
+def test_things_that_are_picked_and_placed_keep_their_ids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[dict[str, str]]()
+    detect = SimRobot.detect
+
+    def noted(self: SimRobot, name: str) -> Frame | None:
+        frame = detect(self, name)
+        if frame is not None and name == "overhead":
+            seen.append({one.label: one.id for one in frame.detections})
+        return frame
+
+    monkeypatch.setattr(SimRobot, "detect", noted)
+    assert run(["campaign", "--seeds", "1", "--noise", "--profile", "ideal", "--out", str(tmp_path)]) == 0
+    every = {(label, name) for ids in seen for label, name in ids.items()}
+    assert len(every) == len(seen[0]) == 2
 
 
 @pytest.mark.long

@@ -10,7 +10,7 @@ import pytest
 
 from openarm_common.config import load_config
 from openarm_common.resources import config_dir
-from openarm_perception.detection.clouds import labelled_cloud
+from openarm_perception.detection.clouds import labelled_cloud, smooth_depth
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
@@ -237,7 +237,7 @@ def test_what_is_seen_through_a_hole_is_none_of_a_things_points(tabletop, x) -> 
         seen.rgb, seen.depth, seen.intrinsics, seen.T_base_camera, None
     )
     assert len(perceived.boxes) == 1
-    cloud = labelled_cloud(seen, perceived.boxes, LIMITS).moved(view.T_base_camera)
+    cloud = labelled_cloud(seen, smooth_depth(seen, LIMITS), perceived.boxes, LIMITS).moved(view.T_base_camera)
     points = cloud.points[cloud.labels == 1]
     assert len(points) > 200
     in_hole = np.abs(points[:, :2] - (x, 0.0)).max(axis=1) < (edge - bar) / 2 - 0.006

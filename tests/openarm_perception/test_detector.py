@@ -144,6 +144,7 @@ def test_a_detection_in_the_image_holds_no_position_in_space() -> None:
     ("change", "fault"),
     [
         ({"hue_deg": (10, 400)}, "0..360"),
+        ({"label": "can"}, "'can' names a shape; expected the name of a colour"),
         ({"saturation": (0.9, 0.2)}, "from < to"),
         ({"label": ""}, "at least 1 character"),
     ],

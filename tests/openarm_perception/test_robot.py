@@ -14,7 +14,7 @@ from openarm_common import se3
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.robot.held import HeldBox
 from openarm_common.scene.scene import load_scene, random_scene
-from openarm_perception.detection.clouds import labelled_cloud
+from openarm_perception.detection.clouds import labelled_cloud, smooth_depth
 from openarm_perception.detection.robot import CloudRobotConfig, RobotConfig, RobotFinder
 from openarm_perception.geometry.depth import DepthLimits, View
 from openarm_perception.ros.convert import mask_image
@@ -158,7 +158,7 @@ def test_the_points_of_objects_are_on_them_and_what_is_around_is_none_of_theirs(
     look = Look(studio, scene, studio.home())
     perceived = look.perceive(look.robot)
     view = View(look.rgb, look.depth, look.K, look.T, look.robot)
-    cloud = labelled_cloud(view, perceived.boxes, DepthLimits()).moved(look.T)
+    cloud = labelled_cloud(view, smooth_depth(view, DepthLimits()), perceived.boxes, DepthLimits()).moved(look.T)
     assert np.allclose(cloud.camera, look.T[:3, 3])
     assert set(cloud.labels.tolist()) == set(range(len(perceived.boxes) + 1))
     for number, place in enumerate(perceived.boxes, start=1):
