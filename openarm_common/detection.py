@@ -63,7 +63,7 @@ class Detection(Described):
         measured: Whether the box is that of the object. If not, it encloses what is visible of the object: an obstacle,
             and a target only where nothing is known of the object but its points.
         code: Why it was not measured: NOTHING_DETECTED (hidden, or cut by the border of the image), or a mismatch.
-        id: Of the object, the same in every image that shows it; empty where it is not followed.
+        id: Id of the object, the same in every image that shows it; empty where it is not followed.
     """
 
     name: str

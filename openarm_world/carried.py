@@ -36,8 +36,8 @@ class Grip:
     """Objects that a carrier holds, and where it was.
 
     Attributes:
-        T_base_box: In the newest image, (4, 4).
-        ids: The objects.
+        T_base_box: Pose of its middle in the newest image, (4, 4).
+        ids: Ids of the objects.
     """
 
     T_base_box: Array

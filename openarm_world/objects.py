@@ -141,7 +141,7 @@ class _Shown:
         points: (n, 3) of all detections, m.
         label: (n,) detection of each, from 1 on.
         owner: (n,) id of its object, once associated; 0: none.
-        state: Of each point of each object: SEEN, FREE, HIDDEN.
+        state: State of each point of each object: SEEN, FREE, HIDDEN.
     """
 
     def __init__(self, tracks: list[Track], view: DepthView, cloud: LabelledCloud, config: WorldConfig) -> None:

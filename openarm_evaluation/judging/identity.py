@@ -31,10 +31,10 @@ class IdentityScore(Generic[T]):
     """Ids of one sequence, frame by frame, or of several.
 
     Attributes:
-        sights: Of true objects.
-        shown: Of ids.
+        sights: Number of sights of true objects.
+        shown: Number of sights of ids.
         right: Sights that the best pairs of objects and ids share, in `close`d sequences.
-        switches: Of ids.
+        switches: Number of changes of the id of an object.
         merged: Sights of objects that share an id with a larger part of another object.
         split: Sights of objects that several ids show, each a part.
     """

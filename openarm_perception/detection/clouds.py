@@ -14,7 +14,7 @@ from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Floats
 from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.geometry.depth import Deprojector, DepthLimits, View
-from openarm_perception.geometry.patch import denoise, keep_edges
+from openarm_perception.geometry.patch import smoothed
 
 #: What lies farther from every detection is far, m.
 _AROUND = 0.15
@@ -26,8 +26,7 @@ def smooth_depth(view: View, limits: DepthLimits) -> Floats:
     """Return the depth (h, w) of an image without the noise of single pixels, m; NaN where none counts."""
     z = view.depth.astype(np.float32) * np.float32(unit_scale(view.depth))
     z = np.where((z >= limits.near) & (z <= limits.far), z, np.float32(np.nan))
-    pixel = 2.0 / (view.intrinsics.fx + view.intrinsics.fy)
-    return keep_edges(z, *denoise(z, pixel), pixel).astype(np.float32)
+    return smoothed(z, view.intrinsics)
 
 
 def labelled_cloud(

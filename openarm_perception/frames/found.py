@@ -21,7 +21,7 @@ from openarm_common.types import Array
 from openarm_perception.detection.detector import ColorDetector, Detection2D
 from openarm_perception.frames.images import Frame
 from openarm_perception.geometry.depth import UNLIMITED, DepthLimits, Points
-from openarm_perception.geometry.patch import denoise, keep_edges
+from openarm_perception.geometry.patch import smoothed
 from openarm_perception.segmentation.clusters import Cluster, Segmentation, segment
 from openarm_perception.segmentation.divide import SegmentationConfig
 from openarm_perception.segmentation.draw import depth_picture, label_picture, overlay
@@ -242,17 +242,15 @@ def followed(objects: Objects, found: Found, t_ns: int) -> tuple[Objects, Found]
 
     Args:
         objects: After the frame before.
-        found: In the frame.
-        t_ns: Its stamp.
+        found: What was found in the frame.
+        t_ns: Stamp of the frame.
     """
     T = np.eye(4) if found.T_base_camera is None else found.T_base_camera
     z, lens = found.frame.points[..., 2], found.frame.intrinsics
-    pixel = 2.0 / (lens.fx + lens.fy)
-    smooth = keep_edges(z, *denoise(z, pixel), pixel).astype(np.float32)
     every = found.segmentation.clusters
     points = np.concatenate([np.empty((0, 3), np.float32), *(one.points for one in every)])
     labels = np.repeat(np.array([one.id for one in every], np.uint32), [len(one.points) for one in every])
-    view = DepthView(smooth, lens, T, UNLIMITED.near, UNLIMITED.far)
+    view = DepthView(smoothed(z, lens), lens, T, UNLIMITED.near, UNLIMITED.far)
     objects, sight = objects.update(view, LabelledCloud(points, labels, T[:3, 3]), t_ns)
     return objects, replace(found, ids=sight.ids)
 

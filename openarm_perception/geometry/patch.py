@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import check_size, unit_scale
-from openarm_common.types import Array
+from openarm_common.types import Array, Floats
 from openarm_perception.detection.detector import Detection2D, Mask
 from openarm_perception.geometry.depth import DepthLimits, View
 
@@ -106,6 +106,12 @@ def denoise(z: Array | NDArray[np.float32], pixel: float) -> tuple[Array, float]
     smooth[smooth > 0.99 * _FAR] = np.nan
     # a median of 25 leaves a quarter of the noise (sqrt(pi / 2 / 25))
     return (np.where(holes, smooth, z), noise) if clean and coarse > _CLEAN else (smooth, 0.25 * noise)
+
+
+def smoothed(z: NDArray[np.float32], intrinsics: Intrinsics) -> Floats:
+    """Return the depth (h, w) of an image, m, NaN where nothing was measured, without noise, and with its edges."""
+    pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
+    return keep_edges(z, *denoise(z, pixel), pixel).astype(np.float32)
 
 
 def _noise(z: Array | NDArray[np.float32]) -> float:
