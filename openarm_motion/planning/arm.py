@@ -280,7 +280,9 @@ class Arm(PlanningGroup):
         self.static: tuple[Box, ...] = tuple(static)
         self._planner: Planner = planner or make_planner(config.planning.planner)
         self.direct = planner is None and config.planning.planner == "fast"  # another one is asked for every path
-        self._limits = config.limits.of(description.motion, name, self.names)
+        limits = config.limits.of(description.motion, name, self.names)
+        fastest = [description.joint(joint).velocity or np.inf for joint in self.names]  # controllers refuse more
+        self._limits = limits._replace(velocity=np.minimum(limits.velocity, fastest))
 
     def start_state(
         self,

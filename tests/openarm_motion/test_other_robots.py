@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from benchmarks.robot_models import ROBOTS, TrueMeshes, load_arm, states_of
 from benchmarks.robot_problems import FAMILIES, problems
 from openarm_common import se3
 from openarm_motion.collision.solids import box_from
+from openarm_motion.config import LimitsConfig, MotionConfig
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.moves import RequestBoxes, to_pose, to_pose_on_line
 from openarm_motion.planning.rrt import FastPlanner
@@ -67,3 +70,12 @@ def test_problems_are_solved_and_no_path_touches_the_triangles_of_the_meshes(nam
             path = FastPlanner().plan(arm.query(scene, now, problem.goals, 20.0)).waypoints
             hits = judge.around(problem.obstacles)
             assert not any(hits(q) for q in states_of(path, 0.02)), family
+
+
+def test_plans_keep_the_speeds_of_the_description_where_the_folder_rounds_them_up(description) -> None:
+    """1.4 rad/s of a folder, 1.3963 of its URDF: the controllers, which read the URDF, refuse more. 0: not known."""
+    names = description.arm_joints("right")
+    slower = [replace(description.joint(names[0]), velocity=1.3963), replace(description.joint(names[1]), velocity=0.0)]
+    limits = LimitsConfig(velocity=(1.4,) * 7, acceleration=(6.0,) * 7, jerk=(60.0,) * 7)
+    arm = Arm("right", description._with_joints(*slower), MotionConfig(limits=limits))
+    np.testing.assert_array_equal(arm.limits(1.0).velocity, [1.3963, *(1.4,) * 6])
