@@ -75,8 +75,8 @@ def new(
         mjcf: The maker's MJCF.
         urdf: The maker's URDF or xacro (`.xacro`), in place of an MJCF.
         arm: NAME=BASE_LINK:TIP_LINK of an arm: what it stands on, and its tool centre point; may be repeated.
-        edits: YAML of what the MJCF lacks: velocity limits, boxes, pads, frames; of a URDF, limits of joints and
-            where it stands.
+        edits: YAML of what the MJCF lacks: velocity limits, boxes, pads, frames; of a URDF, limits and
+            couplings of joints, hulls, and where it stands.
         samples: Random states of the collision matrix.
         out: Folder in which the robot's folder is made; without one, `models/robots`.
         arg: NAME:=VALUE of an argument of the xacro; may be repeated.
@@ -169,6 +169,7 @@ def _arm(text: str) -> tuple[str, tuple[str, str]]:
     """Read NAME=BASE_LINK:TIP_LINK."""
     name, _, links = text.partition("=")
     base, _, tip = links.partition(":")
-    if not (name and base and tip):
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"--arm {text!r}: expected NAME=BASE_LINK:TIP_LINK")
+    if not (name.isidentifier() and base and tip):
+        what = "expected NAME=BASE_LINK:TIP_LINK, with a name of letters, digits and _"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--arm {text!r}: {what}")
     return name, (base, tip)

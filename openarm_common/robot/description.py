@@ -147,7 +147,10 @@ class RobotDescription:
             parent_joint[joint.child] = joint
         roots = [link for link in links if link not in parent_joint]
         if len(roots) != 1:
-            raise fault(f"expected one root link, found {len(roots)}: {', '.join(roots) or 'the joints form a loop'}")
+            found = f"found {len(roots)}: {', '.join(roots) or 'the joints form a loop'}"
+            raise fault(
+                f"expected one root link, {found}{'; join them by fixed joints, or take all but one out' * bool(roots)}"
+            )
         chains = {link: _chain_of(link, parent_joint) for link in links}
         semantics = parse_srdf(srdf)
         _check_semantics(semantics, links, joints)

@@ -163,7 +163,8 @@ def read_mesh(path: Path, scale: Array) -> tuple[Array, NDArray[np.int64]]:
     try:
         loaded = coal.MeshLoader().load(str(path), scale)
     except (RuntimeError, ValueError) as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"can't read mesh {path}: {said(error)}") from error
+        why = said(error).rpartition("message: ")[2]
+        raise OpenArmError(Code.CONFIG_INVALID, f"can't read mesh {path}: {why}") from error
     vertices = np.array(loaded.vertices(), dtype=np.float64).reshape(-1, 3)
     triangles = np.array([[t[0], t[1], t[2]] for t in map(loaded.tri_indices, range(loaded.num_tris))], np.int64)
     if not len(triangles) or not np.isfinite(vertices).all():

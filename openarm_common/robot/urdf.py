@@ -138,7 +138,8 @@ def parse_urdf(text: str) -> tuple[str, dict[str, Link], dict[str, Joint]]:
         leader = joints.get(joint.mimic) if joint.mimic is not None else None
         if joint.mimic is not None and (leader is None or leader.mimic is not None or leader.type == "fixed"):
             why = "does not exist" if leader is None else "is fixed or mimics a joint itself"
-            raise fault(f"joint {joint.name!r} mimics {joint.mimic!r}, which {why}")
+            way = f"name the one that leads, or give `mimic: {{{joint.name}: {{joint: LEADER}}}}` in --edits of a draft"
+            raise fault(f"joint {joint.name!r} mimics {joint.mimic!r}, which {why}; {way}")
     return root.get("name", ""), links, joints
 
 
@@ -242,7 +243,8 @@ def _joint(element: ET.Element) -> Joint:
     if norm < 1e-9:
         raise fault(f"joint {name!r} has the axis (0, 0, 0)")
     if kind in ("revolute", "prismatic") and limit is None:
-        raise fault(f"joint {name!r} is {kind} and has no <limit>")
+        way = f"write one, or `range: {{{name}: [LOWER, UPPER]}}` in --edits of a draft"
+        raise fault(f"joint {name!r} is {kind} and has no <limit>; {way}")
 
     def number(parent: ET.Element | None, key: str, default: float) -> float:
         text = parent.get(key) if parent is not None else None

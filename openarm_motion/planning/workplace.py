@@ -129,7 +129,7 @@ def postures(
             for up, tilts in ways
         )
         over = next(filter(None, tries), [])
-        shoulder = arm.description.link_pose(arm.description.arm(arm.name).base, state)[:3, 3]
+        shoulder = _shoulder(arm.description, arm.name)
         places = product(_LEANS, _HEIGHTS, _AHEAD)
         points = [
             (lean, np.array([shoulder[0] + ahead, shoulder[1] + 0.1 * side, table.top_z + height]))

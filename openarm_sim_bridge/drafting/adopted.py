@@ -24,6 +24,8 @@ _PARTS = ("link", "joint", "material", "mujoco")
 _TAGS = ("visual", "collision")
 #: What edits can say of a URDF.
 _OF_URDF = ("range", "velocity", "effort", "mimic", "fixed", "hulls", "base", "stand", "turn")
+#: Links that a remark names.
+_NAMED = 6
 #: Colour of what has a texture.
 _GREY = "0.5 0.5 0.5 1"
 
@@ -125,7 +127,8 @@ class AdoptedUrdf:
             remarks.append(f"{what}; a link that has no other shows its collision shapes")
         if bare:
             way = "`hulls: [LINK]` in --edits of a new draft gives them hulls of what is seen"
-            remarks.append(f"links that are seen and collide with nothing: {', '.join(bare)}; {way}")
+            more = f" and {len(bare) - _NAMED} more" if len(bare) > _NAMED else ""
+            remarks.append(f"links that are seen and collide with nothing: {', '.join(bare[:_NAMED])}{more}; {way}")
         return tuple(remarks)
 
     def _is_there(self, mesh: ET.Element) -> bool:
@@ -217,7 +220,8 @@ def _without_orphans(root: ET.Element) -> tuple[str, ...]:
             below = [other for other in root.findall("joint") if _link(other, "parent") == link and other not in joints]
             joints += below
             branch += [_link(other, "child") for other in below]
-        for element in [*joints, *(links[link] for link in branch if link in links)]:
+        left_out = [*joints, *(links[link] for link in branch if link in links)]
+        for element in [one for one in root if one in left_out]:
             root.remove(element)
         what = f"joint {joint.get('name')!r} fixes it to {parent!r}, which the file does not have"
         remarks.append(f"left out {', '.join(branch)}: {what}")

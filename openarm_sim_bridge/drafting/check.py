@@ -8,15 +8,19 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from openarm_common.config import read_text
 from openarm_common.errors import OpenArmError, said
 from openarm_common.robot.description import RobotDescription, part_faults
 from openarm_common.robot.folder import RobotFolder, read_folder
 from openarm_common.robot.meshes import mesh_file
-from openarm_sim_bridge.drafting.collisions import LinkContacts
+from openarm_sim_bridge.drafting.collisions import LinkContacts, corners_of
 from openarm_sim_bridge.drafting.semantics import SOURCE
 from openarm_sim_bridge.world.model import import_urdf
 
+#: Longest shape of a link, m.
+_LONG = 5.0
 #: How far a posture may be outside of a limit, which has fewer digits in other files, rad.
 _ROUNDED = 1e-5
 
@@ -35,7 +39,13 @@ def folder_faults(folder: Path) -> list[str]:
     faults = part_faults(parts, robot)
     if faults:  # what follows looks these parts up
         return [*faults, *_mesh_faults(robot, urdf), *_limit_faults(robot)]
-    faults = [*_mesh_faults(robot, urdf), *_limit_faults(robot), *_pad_faults(parts, robot), *_group_faults(robot)]
+    faults = [
+        *_mesh_faults(robot, urdf),
+        *_limit_faults(robot),
+        *_size_faults(robot),
+        *_pad_faults(parts, robot),
+        *_group_faults(robot),
+    ]
     try:
         contacts = LinkContacts(robot)
     except OpenArmError as error:
@@ -75,6 +85,20 @@ def _limit_faults(robot: RobotDescription) -> Iterator[str]:
             given = ", ".join(f"{name} ({values[name]:g})" for name in lacking)
             way = f'for all of them in <limit> of the URDF, or by `{what}: {{"*": NUMBER}}` in --edits of a new draft'
             yield f"joints without a limit of {what} > 0: {given}; give it {way}"
+    if still := [joint.name for joint in joints if joint.lower >= joint.upper]:
+        way = (
+            f"give them in <limit> of the URDF, or by `range: {{{still[0]}: [LOWER, UPPER]}}` in --edits of a new draft"
+        )
+        yield f"joints without limits, or with one for both, so that they can't move: {', '.join(still)}; {way}"
+
+
+def _size_faults(robot: RobotDescription) -> Iterator[str]:
+    for name, link in robot.links.items():
+        if sizes := [
+            size for shape in link.collision if (size := float(np.ptp(corners_of(shape), axis=0).max())) > _LONG
+        ]:
+            way = 'write scale="0.001 0.001 0.001" in its <mesh>'
+            yield f"link {name!r} has a shape {max(sizes):.4g} m long; where it is in mm, {way}"
 
 
 def _pad_faults(parts: RobotFolder, robot: RobotDescription) -> Iterator[str]:

@@ -158,7 +158,9 @@ def _drafted(
         if "stand" not in wanted.model_fields_set:
             what = f"{robot.root!r} stands on {base!r}, {stand[2]:g} m high, as the table"
             remarks.append(f"{what}; `stand: [X, Y, Z]` in --edits of a new draft changes that")
-    remarks += fix_undriven(root, robot, parts) + add_masses(root, robot)
+    remarks += fix_undriven(root, robot, parts)
+    if source.suffix != ".xml":
+        remarks += add_masses(root, robot)
     hand, notes = add_hands(root, robot, parts)
     _write_urdf(urdf, root, licensed=source.suffix == ".xml")
     robot = RobotDescription.from_files(urdf)

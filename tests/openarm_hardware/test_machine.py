@@ -298,6 +298,29 @@ def test_what_is_wrong_at_the_start_is_refused() -> None:
     bench.up()
 
 
+def test_registers_that_are_no_numbers_or_are_not_taken_end_in_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    bench.motors[2].registers[21] = math.nan
+    bench.run(1.0)
+    assert bench.phases[0] is Phase.REFUSED
+    assert "one_3 (motor 0x03 of unix:a) has register PMAX = nan, a DM4340 has 12.5 rad" in bench.machine.text
+    old = Bench()
+    take = old.exchange
+
+    def exchange(sent: list[list[Frame]]) -> None:
+        """Let a motor of another firmware answer a write of its mode with the one that it has."""
+        write, read = frames.write_register(8, 10, 4), frames.read_register(8, 10)
+        take([[read if frame == write else frame for frame in mine] for mine in sent])
+
+    monkeypatch.setattr(old, "exchange", exchange)
+    old.run(0.5)
+    assert "setting mode and timeout of one_finger (motor 0x08 of unix:a)" in old.machine.text
+    assert "firmware" not in old.machine.text
+    old.run(1.5)
+    assert "one_finger (motor 0x08 of unix:a) does not take CTRL_MODE = 4, has " in old.machine.text
+    assert "; `openarm hardware scan` names its firmware" in old.machine.text
+
+
 def test_lost_and_late_replies_are_no_false_alarm() -> None:
     bench = Bench(silent=5)
     bench.buses.inject("loss", value=0.05)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -272,6 +273,9 @@ def test_a_branch_that_is_fixed_to_nothing_is_left_out_and_one_that_moves_is_ref
         "world",
         "mine_stand",
     ]
+    # a link of a branch that is out already
+    _, draft = drafted(tmp_path / "3", robot(more=branch.format("fixed") + joint("t", "fixed", "neck", "screw")))
+    assert [remark.partition(":")[0] for remark in told(draft)] == ["left out logo, screw", "left out screw"]
     moving = link("head") + joint("h", "revolute", "neck", "head")
     refused("joint 'h' has the parent link 'neck', which does not exist", drafted, tmp_path / "2", robot(more=moving))
 
@@ -425,3 +429,152 @@ def test_the_command_takes_arguments_packages_and_says_what_is_left(tmp_path):
     assert work == "work: not looked for, since no arm has a hand: it is planned for alone"
     assert done.data["faults"] == []
     assert isinstance(mujoco.MjModel.from_xml_path(str(tmp_path / "robots" / "mine" / "mine.urdf")), mujoco.MjModel)
+
+
+def test_a_visual_mesh_that_is_not_there_is_left_out_and_its_link_shows_what_collides(tmp_path):
+    write_stl(tmp_path / "m.stl", TETRAHEDRON, FACES)
+    (tmp_path / "pointer.stl").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    both = "".join(mesh(name).split("<collision>")[0] for name in ("pointer.stl", "lost.stl"))
+    folder, draft = drafted(tmp_path, robot(both + mesh("m.stl").split("</visual>")[1]))
+    (remark,) = told(draft)
+    assert remark.startswith(
+        "left out visual meshes that are not there: pointer.stl, lost.stl; a link that has no other"
+    )
+    upper = RobotDescription.from_files(folder / "mine.urdf").links["upper"]
+    assert len(upper.meshes) == len(upper.collision) == 1
+    assert folder_faults(folder) == []
+    words = "there is no mesh .*pointer.stl, but what Git LFS has in its place; `git lfs pull` in its folder brings it"
+    refused(words, drafted, tmp_path / "2", robot(mesh(str(tmp_path / "pointer.stl"))))
+    (tmp_path / "parts").mkdir()
+    words = f"tried .*; {tmp_path / 'parts'} lacks it: get the file there, or name its folder by --package parts=FOLDER"
+    refused(words, drafted, tmp_path / "3", robot(mesh("package://parts/lost.stl")))
+
+
+def test_edits_of_a_urdf_couple_and_fix_joints_and_let_links_collide_where_they_are_seen(tmp_path):
+    write_stl(tmp_path / "m.stl", TETRAHEDRON, FACES)
+    more = link("a") + link("b") + joint("ja", "revolute", "tip", "a") + joint("jb", "revolute", "tip", "b")
+    text = robot(mesh("m.stl").split("<collision>")[0], more + link("c") + joint("jc", "floating", "a", "c"))
+    edits = tmp_path / "edits.yaml"
+    edits.write_text("fixed: [jc]\n")
+    _, draft = drafted(tmp_path / "1", text.replace("m.stl", str(tmp_path / "m.stl")), edits=edits)
+    words = "links that are seen and collide with nothing: upper; `hulls: [LINK]` in --edits of a new draft"
+    assert any(remark.startswith(words) for remark in draft.remarks)
+    edits.write_text('fixed: ["j*"]\nhulls: [upper]\n')
+    folder, draft = drafted(tmp_path / "2", text.replace("m.stl", str(tmp_path / "m.stl")), edits=edits)
+    found = RobotDescription.from_files(folder / "mine.urdf")
+    assert {name for name, one in found.joints.items() if one.type != "fixed"} == {"shoulder"}
+    assert found.links["upper"].collision[0].size == pytest.approx((0.03, 0.02, 0.1))
+    assert told(draft) == ()
+    edits.write_text("fixed: [jc]\nmimic: {jb: {joint: ja, multiplier: -0.5}}\n")
+    folder, _ = drafted(tmp_path / "3", text.replace("m.stl", str(tmp_path / "m.stl")), edits=edits)
+    coupled = RobotDescription.from_files(folder / "mine.urdf").joints["jb"]
+    assert (coupled.mimic, coupled.multiplier) == ("ja", -0.5)
+
+
+BOX = '<collision><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
+
+
+@pytest.mark.parametrize(
+    ("inertial", "mass", "words"),
+    [
+        ("", 6.0, "no mass: upper; taken as heavy as water, 6 kg together; where it is known, give it in <inertial>"),
+        (INERTIA.replace('ixx="0.01"', 'ixx="1"'), 1.0, "an inertia that no body has: upper; taken as that of a box"),
+        (INERTIA.replace('"0.01"', '"0"'), 1.0, "an inertia that no body has: upper; taken as that of a box"),
+    ],
+)
+def test_what_moves_is_weighed_where_its_mass_or_inertia_is_none(tmp_path, inertial, mass, words):
+    folder, draft = drafted(
+        tmp_path, robot(BOX).replace(link("upper", BOX), link("upper", BOX).replace(INERTIA, inertial))
+    )
+    (remark,) = told(draft)
+    assert remark.startswith(words)
+    assert folder_faults(folder) == []
+    body = import_urdf(RobotDescription.from_files(folder / "mine.urdf")).compile().body("upper")
+    assert body.mass[0] == pytest.approx(mass)
+    # of a box: m / 12 (b2 + c2)
+    moments = mass / 12.0 * np.array([0.2**2 + 0.3**2, 0.1**2 + 0.3**2, 0.1**2 + 0.2**2])
+    assert sorted(body.inertia) == pytest.approx(sorted(moments), rel=1e-4)
+
+
+@pytest.mark.parametrize("span", ['lower="0" upper="0.04"', 'lower="-0.04" upper="0"'])
+def test_of_two_equal_fingers_the_second_follows_the_first_as_they_close(tmp_path, span):
+    sign = 1.0 if span.startswith('lower="0"') else -1.0
+    left = joint("left", "prismatic", "upper", "l", span='lower="0" upper="0.04"')
+    right = joint("right", "prismatic", "upper", "r", span=span).replace('"0 1 0"', f'"0 {-sign:g} 0"')
+    pad = '<collision name="{}_pad_collision"><origin xyz="0 {} 0"/><geometry><box size="0.01 0.01 0.01"/></geometry>'
+    fingers = "".join(link(name, f"{pad.format(name, at)}</collision>") for name, at in (("l", 0.01), ("r", -0.01)))
+    arm, gripper, remarks = hand(tmp_path, fingers + left + right)
+    assert "'right' is taken to follow 'left', as the other finger of its hand" in remarks
+    assert (arm["finger_joint"], arm["fingers"]) == ("left", ["l", "r"])
+    assert gripper == {"open": {"arm": 0.04}, "closed": {"arm": 0.0}}
+    coupled = RobotDescription.from_files(tmp_path / "robots" / "mine" / "mine.urdf").joints["right"]
+    assert (coupled.mimic, coupled.multiplier, coupled.offset) == ("left", sign, 0.0)
+
+
+def test_a_finger_is_the_part_of_it_that_reaches_farthest(tmp_path):
+    box = '<collision><origin xyz="0 0 {}"/><geometry><box size="0.02 0.01 {}"/></geometry></collision>'
+    more = joint("left", "prismatic", "upper", "l", span='lower="0" upper="0.04"') + joint(
+        "right", "prismatic", "upper", "r", '<mimic joint="left" multiplier="-1"/>', 'lower="-0.04" upper="0"'
+    )
+    for name in ("l", "r"):
+        more += link(name, box.format(0.0, 0.02)) + link(f"{name}_tip", box.format(0.0, 0.06)) + link(f"{name}_frame")
+        more += joint(f"{name}_f", "fixed", name, f"{name}_tip") + joint(
+            f"{name}_g", "fixed", f"{name}_tip", f"{name}_frame"
+        )
+    assert hand(tmp_path, more)[0]["fingers"] == ["l_tip", "r_tip"]
+
+
+def test_what_slides_below_the_arms_is_their_lift(tmp_path):
+    column = (
+        link("foot")
+        + link("column", BOX)
+        + joint("rail", "prismatic", "foot", "column", span='lower="0.1" upper="0.5"')
+    )
+    text = robot(BOX, column + joint("mount", "fixed", "column", "base")).replace('xyz="0 0 0.2"', 'xyz="0 0 0.5"')
+    folder, _ = drafted(tmp_path, text)
+    assert yaml.safe_load((folder / "robot.yaml").read_text())["lift"] == {"joint": "rail", "home": 0.1}
+    assert folder_faults(folder) == []
+
+
+def test_a_draft_whose_links_touch_at_0_has_another_home(tmp_path):
+    elbow = link("fore", BOX) + joint("elbow", "revolute", "tip", "fore", span='lower="-3" upper="3"')
+    more = elbow.replace('<origin xyz="0 0 0.2"/>', '<origin xyz="0.3 0 0"/>') + link("end")
+    text = robot(BOX, more + joint("end_fixed", "fixed", "fore", "end")).replace(
+        link("base"), link("base", BOX.replace("<geometry>", '<origin xyz="0.35 0 0.35"/><geometry>'))
+    )
+    source = tmp_path / "r.urdf"
+    source.write_text(text)
+    draft = draft_folder(tmp_path / "mine", source, {"arm": ("base", "end")}, samples=10)
+    assert "links touch with all joints at 0; posture 'home' is another, where none do" in draft.remarks
+    assert list(yaml.safe_load((tmp_path / "mine" / "semantics.yaml").read_text())["postures"]) == ["home"]
+    assert folder_faults(tmp_path / "mine") == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            ('lower="-1" upper="1"', ""),
+            "joints without limits, or with one for both, so that they can't move: shoulder; ",
+        ),
+        (('lower="-1" upper="1"', 'lower="1" upper="1"'), "joints without limits, or with one for both, .*`range: "),
+        (("0.1 0.2 0.3", "100 200 300"), "link 'upper' has a shape 300 m long; where it is in mm, write scale="),
+    ],
+)
+def test_a_joint_without_limits_and_a_mesh_in_mm_are_to_do(tmp_path, change, words):
+    folder, _ = drafted(tmp_path, robot(BOX).replace(*change))
+    assert any(re.match(words, fault) for fault in folder_faults(folder))
+
+
+def test_links_that_touch_in_nearly_all_states_are_not_checked_and_said(tmp_path):
+    ball = '<collision><geometry><sphere radius="0.98"/></geometry></collision>'
+    slide = joint("slide", "prismatic", "tip", "fore", span='lower="0" upper="1"')
+    more = link("fore", ball) + slide + link("end") + joint("end_fixed", "fixed", "fore", "end")
+    text = robot(BOX, more).replace('lower="-1" upper="1"', 'lower="-0.01" upper="0.01"', 1)
+    # the ball leaves the box of the base, 0.45 m below it, where it has gone 0.97 m
+    (tmp_path / "r.urdf").write_text(text.replace(link("base"), link("base", BOX)))
+    draft = draft_folder(tmp_path / "mine", tmp_path / "r.urdf", {"arm": ("base", "end")}, samples=10)
+    words = "not checked, since they touch in nearly all states: base and fore; may_touch in semantics.yaml says so"
+    assert told(draft) == (words,)
+    assert folder_faults(tmp_path / "mine") == []
+    assert draft.reasons[frozenset(("base", "fore"))] == "Default"
