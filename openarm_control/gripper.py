@@ -3,7 +3,8 @@
 
 Positions, velocities and efforts are those of the driving finger joint (m, N of a slide; rad, N m of a hinge); the
 configuration is of a finger, m from the middle, and the lever of the joint group lies between. The command ramps to the
-goal and stays there, so a gripper that is stopped by an object keeps pressing with the effort limit.
+goal and stays there, so a gripper that is stopped by an object keeps pressing with the effort limit. A hand that presses on
+something opens from where its fingers are.
 """
 
 from __future__ import annotations
@@ -150,6 +151,8 @@ class GripperFollower(Follower):
             done: Called once, from `update` or `start`, when the goal ends.
         """
         self._finish(End.ABORTED, position, effort, "a newer goal took its place")
+        if self.pressing and (goal.position - position) * self.group.lever > 0.0:
+            self._command.hold([position])
         self._aim(goal.position, goal.max_velocity, goal.max_effort)
         self._done, self._cancelled, self._still_ns, self._arrived_ns = done, False, 0, None
 
@@ -175,15 +178,16 @@ class GripperFollower(Follower):
             return
         still = abs(velocity) * self._lever <= config.stall_velocity
         self._still_ns = self._still_ns + dt_ns if still else 0
-        if self._command.position[0] != self._target[0]:
-            return
-        if self._arrived_ns is None:
+        lag, arrived = self._command.position[0] - position, self._command.position[0] == self._target[0]
+        if arrived and self._arrived_ns is None:
             self._arrived_ns = t_ns
-        if still and abs(position - self._target[0]) * self._lever <= config.goal_tolerance:
+        # fingers that lag behind a command which is still on its way have met something, too
+        behind = lag * np.sign(self._target[0] - position) * self._lever > _PRESSING
+        if arrived and still and abs(position - self._target[0]) * self._lever <= config.goal_tolerance:
             self._finish(End.SUCCEEDED, position, effort, "goal reached", reached=True)
-        elif self._still_ns >= config.stall_time * 1e9:
+        elif (arrived or behind) and self._still_ns >= config.stall_time * 1e9:
             self._finish(End.SUCCEEDED, position, effort, "stalled", stalled=True)
-        elif t_ns - self._arrived_ns > config.timeout * 1e9:
+        elif self._arrived_ns is not None and t_ns - self._arrived_ns > config.timeout * 1e9:
             self._finish(
                 End.ABORTED,
                 position,

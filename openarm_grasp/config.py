@@ -81,13 +81,10 @@ class HandConfig(Config):
 
 
 class TimingConfig(Config):
-    """Pauses of the grasp."""
+    """Pauses of the grasp, for who watches a robot; nothing else needs them."""
 
-    pause_at_grasp: float = Field(default=0.5, ge=0.0, le=5.0, description="at the grasp before the hand closes, s")
-    after_close: float = Field(default=0.2, ge=0.0, le=5.0, description="after the hand has closed, before the lift, s")
-    after_release: float = Field(
-        default=0.2, ge=0.0, le=5.0, description="after the hand has opened, before it leaves, s"
-    )
+    pause_at_grasp: float = Field(default=0.0, ge=0.0, le=5.0, description="at the grasp before the hand closes, s")
+    after_close: float = Field(default=0.0, ge=0.0, le=5.0, description="after the hand has closed, before the lift, s")
     settle_limit: float = Field(default=1.0, gt=0.0, le=5.0, description="longest wait for the fingers to rest, s")
 
 
@@ -343,7 +340,7 @@ class GraspConfig(Config):
         default_factory=table_camera, description="that the detections come from; named by the drift alarm"
     )
     velocity_scale: float = Field(
-        default=0.0, ge=0.0, le=1.0, description="of the motion limits; 0 = the planner's default"
+        default=1.0, ge=0.0, le=1.0, description="of the motion limits; 0 = the planner's default"
     )
     sampler: str = Field(
         default="auto",

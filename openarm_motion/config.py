@@ -26,7 +26,7 @@ class LimitsConfig(Config):
     velocity: tuple[float, ...] = Field(default=(), description="rad/s, one number a joint; empty: the robot's")
     acceleration: tuple[float, ...] = Field(default=(), description="rad/s2, one number a joint; empty: the robot's")
     jerk: tuple[float, ...] = Field(default=(), description="rad/s3, one number a joint; empty: the robot's")
-    straight_speed: float = Field(default=0.25, gt=0.0, le=2.0, description="tool on straight lines at scale 1, m/s")
+    straight_speed: float = Field(default=0.5, gt=0.0, le=2.0, description="tool on straight lines at scale 1, m/s")
     default_scale: float = Field(default=0.5, gt=0.0, le=1.0, description="velocity scale of a request that has none")
 
     @model_validator(mode="after")

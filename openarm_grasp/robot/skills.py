@@ -453,9 +453,7 @@ class Skills:
         """
         hand, robot, limit = self._hands[arm], self.robot, 20.0 * settle + 10.0
         robot.check()
-        ready_ns = robot.now_ns + SPEED_WINDOW_NS
-        await robot.until(lambda: robot.now_ns >= ready_ns, limit, "reading the hand")
-        end_ns = ready_ns + round(settle * 1e9)
+        end_ns = robot.now_ns + round(settle * 1e9)
 
         def at_rest() -> bool:
             try:

@@ -402,7 +402,6 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
     run.hand = Hand.RELEASED
     reason = "put down and let go" if ways is grasp.places else "put back where it stood"
     try:
-        await robot.wait(config.timing.after_release)
         await robot.follow(arm, plan.retreat, "leave")
         if grasp.candidate.opened is not None:
             await robot.open(arm, "open")

@@ -69,7 +69,6 @@ async def _leave(run: Run, grasp: Grasp, placed: Placed | None, held: float) -> 
         await _put_back(run, grasp)
         run.hand = Hand.AT_OBJECT
     await robot.open(arm, "open", grasp.candidate.opened, held=held)
-    await robot.wait(config.timing.after_release)
     if at_object:
         await robot.move_linear(arm, se3.make(p=grasp.candidate.approach_offset) @ T_base_tcp, "back off")
 
