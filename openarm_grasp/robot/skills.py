@@ -7,7 +7,7 @@ does not succeed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from math import inf
 from typing import Literal
 
@@ -21,7 +21,7 @@ from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
 from openarm_grasp.evidence.verdicts import Evidence, learn_command
-from openarm_grasp.perception.detections import Sighting, in_base
+from openarm_grasp.perception.detections import Frame, Sighting, in_base
 from openarm_grasp.planning.candidates import (
     UP,
     Box,
@@ -121,6 +121,37 @@ class Skills:
         seen = await self.observe(count)
         self.stop_observing()
         return self.in_base(seen)
+
+    async def observe_towards_end(
+        self, motion: Callable[[], Awaitable[None]], near_end: Callable[[], bool], count: int
+    ) -> tuple[Frame, ...]:
+        """Carry out a motion, and observe from near its end on, while the arm comes to rest.
+
+        Args:
+            motion: Motion of the arm.
+            near_end: Whether it is near enough to its end.
+            count: Number of frames of the camera over the table.
+
+        Raises:
+            OpenArmError: As the motion, then as `observe`.
+        """
+        ended, frames = list[bool](), list[Frame]()
+
+        async def move() -> None:
+            try:
+                await motion()
+            except BaseException:
+                ended.append(False)
+                raise
+            ended.append(True)
+
+        async def look() -> None:
+            await self.robot.until(lambda: bool(ended) or near_end(), self._config.limits.move_timeout, "the motion")
+            if ended != [False]:
+                frames.extend((await self.observe(count)).frames)
+
+        await self.robot.together([move, look])
+        return tuple(frames)
 
     # --- planning
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
@@ -325,9 +356,7 @@ class Skills:
         for arm in arms:
             if arm not in self._arms:
                 continue
-            home = robot.description.group_state(f"{arm}_arm", config.home_state)
-            _, q = robot.states.latest()
-            if robot.description.away(home, q) <= config.home_tolerance:
+            if self.away_from_home(arm) <= config.home_tolerance:
                 continue
             T_base_tcp = self._hands[arm].T_base_tcp()
             if T_base_tcp[2, 3] < back_off_below:
@@ -338,6 +367,11 @@ class Skills:
                     reraise_stop(error)
                     robot.warn(error.message)  # the free path home may still be there
             await self._home(arm, obstacles)
+
+    def away_from_home(self, arm: str) -> float:
+        """How far the joint that is farthest from the home posture is from it, rad."""
+        home = self.description.group_state(f"{arm}_arm", self._config.home_state)
+        return self.description.away(home, self.robot.states.latest()[1])
 
     async def _home(self, arm: str, obstacles: Sequence[Box]) -> None:
         """Move an arm to its home posture; where there is no way, because something leans on the hand, rise first."""

@@ -44,6 +44,8 @@ from openarm_grasp.strategies.verify import verify
 _BLIND = (Code.NOT_READY, Code.STALE_DATA, Code.TIMEOUT)
 #: Frames that must not show the object in its old place after the lift: a detector may miss it in one.
 _LIFT_FRAMES = 2
+#: The camera looks from when the hand is so near to the top of the lift, m.
+_ARRIVING = 0.005
 #: What meets something on its way down to its place is let go this high above it, m; what has turned, anywhere.
 _MET_AT = 0.015
 
@@ -117,9 +119,9 @@ async def _attempts(run: Run) -> GraspOutcome:
             grasp = run.grasp or grasp  # corrected by the second observation
             run.fail(error.code, error.message)
             run.enter(State.RESET, error.message)
-        await retreat(run, grasp, placed)
+        frames = await retreat(run, grasp, placed)
         if placed is not None and placed.failure is None:
-            seen = await verify(run, grasp, placed)
+            seen = await verify(run, grasp, placed, frames)
             if seen.ok:
                 points = se3.apply(grasp.motion_to(placed.target), object_points(grasp.sighting.clouds))
                 run.task.session.note_placed((run.place_target or placed.target).position, points)
@@ -281,18 +283,23 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
     """
     arm, robot, config, sighting = grasp.arm, run.robot, run.config, grasp.sighting
     run.enter(State.LIFT, why)
-    try:
-        await robot.follow(arm, plan.retreat, "lift", carrying=True)
-    except OpenArmError as error:
-        if error.code is Code.GRASP_LOST:
-            run.hand = Hand.AT_OBJECT
-        end = grasp.candidate.T_base_tcp[:3, 3] + grasp.candidate.retreat_offset
-        sag = float(np.linalg.norm(robot.T_base_tcp(arm)[:3, 3] - end))
-        if error.code is not Code.EXECUTION_FAILED or sag > config.held.sag:
-            raise
-        robot.warn(f"lift: the {arm} arm gives way to the weight by {sag * 1e3:.0f} mm")
+    top = grasp.candidate.T_base_tcp[:3, 3] + grasp.candidate.retreat_offset
+
+    def sag() -> float:
+        return float(np.linalg.norm(robot.T_base_tcp(arm)[:3, 3] - top))
+
+    async def rise() -> None:
+        try:
+            await robot.follow(arm, plan.retreat, "lift", carrying=True)
+        except OpenArmError as error:
+            if error.code is Code.GRASP_LOST:
+                run.hand = Hand.AT_OBJECT
+            if error.code is not Code.EXECUTION_FAILED or sag() > config.held.sag:
+                raise
+            robot.warn(f"lift: the {arm} arm gives way to the weight by {sag() * 1e3:.0f} mm")
+
+    frames = await robot.observe_towards_end(rise, lambda: sag() <= _ARRIVING, _LIFT_FRAMES)
     evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
-    frames = (await robot.observe(_LIFT_FRAMES)).frames
     gripper = grasp.judge(evidence, config.held, was_held=True)
     if grasp.of_cloud:
         T, points = robot.T_base_tcp(arm), risen_points(frames, sighting, config.held.rise)

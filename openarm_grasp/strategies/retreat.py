@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning import candidates
 from openarm_grasp.planning.neighbours import neighbours
 from openarm_grasp.planning.options import NO_WAY
@@ -22,43 +23,67 @@ from openarm_grasp.robot.skills import reraise_stop
 if TYPE_CHECKING:
     from openarm_grasp.strategies.run import Run
 
+#: An arm whose joints are all so near to home leaves the camera's view free, rad.
+_NEARLY_HOME = 0.2
+
 
 def still_held(run: Run, error: OpenArmError) -> str:
     """Sentence for an object that stays in the hand."""
     return f"{error.message}; the {run.arm} hand still holds {run.label!r}: open it over a safe place"
 
 
-async def retreat(run: Run, grasp: Grasp, placed: Placed | None) -> None:
+async def retreat(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[Frame, ...]:
     """Leave the object, putting it down first when it is held, and go home with an open hand.
 
     An empty hand that finds no way home, also without regard to obstacles, stays where it is.
+
+    Returns:
+        Frames of what was placed, taken as the arm came home; none without.
 
     Raises:
         OpenArmError: When the hand holds the object and finds none, or the arm does not do what was planned.
     """
     run.robot.stop_observing()
     failure, held = run.failure if placed is None else placed.failure, run.robot.aperture(grasp.arm)
+    frames: tuple[Frame, ...] = ()
     for last, obstacles in ((False, _obstacles(run, grasp, placed)), (True, ())):
         try:
             await _leave(run, grasp, placed, held)
-            await run.robot.go_home((grasp.arm,), obstacles)
-            return
+            frames = await _home(run, grasp.arm, obstacles, run.config.detect.frames if placed else 0)
+            break
         except OpenArmError as error:
             reraise_stop(error)
             if last and error.code in NO_WAY and not run.holding:
                 run.robot.warn(f"{error.message}; it stays where it is")
-                return
+                break
             if last or run.holding:
                 text = f"the arm could not go home: {still_held(run, error) if run.holding else error.message}"
                 code, text = (failure.code, f"{failure.reason}; {text}") if failure else (error.code, text)
                 raise OpenArmError(code, text) from error
             run.hand = Hand.FREE if placed is None else Hand.CLEAR
             run.enter(State.RESET, f"{error.message}; trying another way home")
+    return frames
+
+
+async def _home(run: Run, arm: str, obstacles: tuple[candidates.Box, ...], frames: int) -> tuple[Frame, ...]:
+    """Go home, and observe so many frames as the arm comes there."""
+    robot = run.robot
+    if not frames:
+        await robot.go_home((arm,), obstacles)
+        return ()
+    try:
+        return await robot.observe_towards_end(
+            lambda: robot.go_home((arm,), obstacles), lambda: robot.away_from_home(arm) <= _NEARLY_HOME, frames
+        )
+    except OpenArmError as error:
+        if error.code is not Code.STALE_DATA:
+            raise
+        return ()  # the arm is home; who needs them observes again
 
 
 async def _leave(run: Run, grasp: Grasp, placed: Placed | None, held: float) -> None:
     """Free the hand, which may hold the object with that gap, m, and bring it away on a straight line."""
-    arm, robot, config, T_base_tcp = grasp.arm, run.robot, run.config, grasp.candidate.T_base_tcp
+    arm, robot, T_base_tcp = grasp.arm, run.robot, grasp.candidate.T_base_tcp
     if placed is not None:
         if run.hand is Hand.RELEASED:
             T_away = se3.make(p=placed.target.retreat_offset) @ placed.target.T_base_tcp

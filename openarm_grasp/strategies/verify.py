@@ -36,24 +36,28 @@ _SEEN_WITHIN = 0.75
 _PART_WITHIN = 0.5
 
 
-async def verify(run: Run, grasp: Grasp, placed: Placed) -> CameraVerdict:
+async def verify(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]) -> CameraVerdict:
     """Judge by the camera, from home, whether the object is at its place.
+
+    Args:
+        run: The request.
+        grasp: How the hand held the object.
+        placed: Where the hand has put it.
+        frames: Frames taken as the arm came home; others are taken when they do not show it.
 
     Raises:
         OpenArmError: PLACE_FAILED, when no frame comes.
     """
-    config, robot, text = run.config, run.robot, "home; observing the place"
-    frames: tuple[Frame, ...] = ()
+    config, robot = run.config, run.robot
     for _ in range(config.detect.attempts):
-        run.enter(State.RESET, text)
+        if any(d.label == run.label for frame in frames for d in frame.detections):
+            break
+        run.enter(State.RESET, f"{run.label!r} is not in view after the place; observing again")
         try:
             frames = (await robot.observe(config.detect.frames)).frames
         except OpenArmError as error:
             reraise_stop(error)
             raise OpenArmError(Code.PLACE_FAILED, f"put down, but not seen since: {error.message}") from error
-        if any(d.label == run.label for frame in frames for d in frame.detections):
-            break
-        text = f"{run.label!r} is not in view after the place; observing again"
     if grasp.of_cloud:
         return _judge_shape(run, grasp, placed, frames)
     error = placing_error(run.label, placed.target, frames[-1]) if frames else None
