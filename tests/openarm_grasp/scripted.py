@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -240,6 +240,12 @@ class World(Skills):
         T_off = se3.make(p=(self.near_off, 0.0, 0.0))
         shifted = (replace(d, T_base_object=T_off @ d.T_base_object) for d in seen.frames[-1].detections)
         return Frames((replace(seen.frames[-1], detections=tuple(shifted)),) * count, seen.frame_id)
+
+    async def observe_towards_end(
+        self, motion: Callable[[], Awaitable[None]], near_end: Callable[[], bool], count: int
+    ) -> tuple[Frame, ...]:
+        await motion()
+        return (await self.observe(count)).frames
 
     def in_base(self, seen: Frames) -> Frames:
         self.call(ToBase())

@@ -35,8 +35,6 @@ def test_every_parameter_is_described_and_numbers_have_a_range(name, field):
 @pytest.mark.parametrize(
     ("section", "key", "value"),
     [
-        ("timing", "pause_at_grasp", 0.5),  # B-52
-        ("timing", "after_close", 0.2),  # B-54
         ("approach", "max_width", 0.078),  # B-17
         ("detect", "max_age", 0.5),  # P-33
         ("limits", "max_attempts", 3),

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from openarm_bringup import load_graph
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
-from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Observe, ToBase, Wait
+from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Observe, ToBase
 
 
 # --- success
@@ -39,20 +40,15 @@ def test_the_hand_opens_on_the_way_to_the_pregrasp(world):
 
 
 @pytest.mark.requirement("B-52", "B-53", "B-54")
-def test_pause_close_wait_lift(world):
+def test_pauses_are_those_of_the_graph_and_real_robots_have_some(worlds, box):
+    grasp = load_graph("real").nodes["grasp"].params
+    world = worlds(box("red", 0.26, -0.2), timing=grasp["timing"])
     world.grasp()
     (close,) = world.times(world.grips(opening=False))
     (arrive,) = world.times(world.follows_path("approach"))
     (lift,) = world.times(world.follows_path("lift"))
     assert close - (arrive + 1.0) == pytest.approx(0.5)  # the motion takes 1 s
     assert lift - (close + 0.6) == pytest.approx(0.2)  # the fingers take 0.6 s
-
-
-@pytest.mark.requirement("B-54")
-def test_timing_is_a_parameter(worlds, box):
-    world = worlds(box("red", 0.26, -0.2), timing={"pause_at_grasp": 1.5, "after_close": 0.7})
-    world.grasp()
-    assert [e.duration for e in world.done(Wait)][:2] == [1.5, 0.7]
 
 
 @pytest.mark.requirement("B-71")

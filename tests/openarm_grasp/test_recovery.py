@@ -18,7 +18,7 @@ from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import Frames, PlanGrasp, PlanPlace
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Wait
+from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear
 
 
 # --- grasping
@@ -27,7 +27,7 @@ def test_a_miss_opens_backs_off_and_tries_another_way(world):
     world.slips = 1
     assert world.succeeds().attempts == 2
     missed = world.log[world.log.index(next(x for x in world.log if world.grips(opening=False)(x[1]))) :]
-    assert [type(e) for _, e in missed[3:8]] == [Grip, Wait, MoveLinear, GoHome, GoHome]  # pause, measure
+    assert [type(e) for _, e in missed[3:7]] == [Grip, MoveLinear, GoHome, GoHome]  # pause, measure
     first, second = world.done(PlanGrasp)
     assert first.candidates[0].id not in {way.id for way in second.candidates}
 
