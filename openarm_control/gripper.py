@@ -3,8 +3,8 @@
 
 Positions, velocities and efforts are those of the driving finger joint (m, N of a slide; rad, N m of a hinge); the
 configuration is of a finger, m from the middle, and the lever of the joint group lies between. The command ramps to the
-goal and stays there, so a gripper that is stopped by an object keeps pressing with the effort limit. A hand that presses on
-something opens from where its fingers are.
+goal and stays there, so a gripper that is stopped by an object keeps pressing with the effort limit. A hand that
+presses on something opens from where its fingers are.
 """
 
 from __future__ import annotations

@@ -35,6 +35,7 @@ def pick(
     yaw: list[float] | None = None,
     phase: Literal["all", "pick", "place", "aside"] = "all",
     time_limit: float = 0.0,
+    speed: float = 0.0,
     dry_run: bool = False,
     confirm: bool = False,
     domain: Domain = None,
@@ -58,6 +59,7 @@ def pick(
         phase: pick ends with the object in the hand, place puts down what the hand holds; all does both. aside pushes
             the object away from where it is.
         time_limit: Time limit of the robot, s; then it holds, and the hand keeps what it holds. 0 is none.
+        speed: Share of the limits of the joints, 0.001 to 1; 0 is that of the graph: 1 simulated, 0.5 on a real robot.
         dry_run: Plan and report, do not move.
         confirm: Show each plan and ask before it is executed; without a terminal, /grasp/confirm is to answer.
         timeout: Longest wait, s.
@@ -84,7 +86,7 @@ def pick(
         }
         for name, which, where, turn, spot in zip(labels, arms, places, yaws, spots, strict=True)
     ]
-    run: dict[str, Any] = {"dry_run": dry_run, "time_limit": time_limit, "timeout": timeout}
+    run: dict[str, Any] = {"dry_run": dry_run, "time_limit": time_limit, "speed": speed, "timeout": timeout}
     run["on_feedback"] = _Steps(labels)
     with requires_node("grasp", "sim"), GraspClient() as client:
         try:
@@ -211,7 +213,12 @@ def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
 
 
 def order(
-    *labels: str, bins: Path | None = None, each: int = 0, domain: Domain = None, timeout: float = 300.0
+    *labels: str,
+    bins: Path | None = None,
+    each: int = 0,
+    speed: float = 0.0,
+    domain: Domain = None,
+    timeout: float = 300.0,
 ) -> Outcome:
     """Pick several objects of the running graph and place them, until nothing is left or nothing can be done.
 
@@ -223,6 +230,7 @@ def order(
         labels: What to pick, in this order: each words as for `pick`.
         bins: YAML with `bins` (rectangles x, y on the table, m), `classes` (bin of a label) and `rest` (bin of others).
         each: Most objects of each label; 0 is all.
+        speed: Share of the limits of the joints, as for `pick`.
         timeout: Longest wait for one object, s.
     """
     from openarm_grasp.requests.orders import Order, load_bins
@@ -241,6 +249,7 @@ def order(
                     object_at=ask.object_at,
                     exclude_near=ask.exclude_near,
                     place_choices=ask.place_choices,
+                    speed=speed,
                     timeout=timeout,
                 )
             except KeyboardInterrupt:

@@ -51,7 +51,7 @@ class InProcessRobot:
         self.together = robot.together
         self._config = config
         self.cancelled = ""
-        self.deadline_ns = 0
+        self.deadline_ns, self.velocity_scale = 0, config.velocity_scale
         #: Longest start delay of a motion until the other arm leaves clearance, s; 0: the arms never move at once.
         self.max_start_delay = 0.0
         #: Called after each tick; what it raises ends what is waited for.
@@ -164,7 +164,7 @@ class InProcessRobot:
             request.arm,
             approach_of(request),
             start,
-            self._config.velocity_scale,
+            self.velocity_scale,
             boxes_of(request.ignore_regions),
         )
         answer = await self._asked(lambda stopped: self.robot.motion.plan_approach(asked, stopped))
@@ -209,7 +209,7 @@ class InProcessRobot:
             goal,
             boxes_of(obstacles),
             hand_empty=True,
-            scale=self._config.velocity_scale,
+            scale=self.velocity_scale,
             max_start_delay=self.max_start_delay,
             plan_only=plan_only,
         )

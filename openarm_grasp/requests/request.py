@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 #: (x, y), base frame, m.
 Spot = tuple[float, float]
+#: Slowest motions, as a share of the limits of the joints.
+LEAST_SCALE = 0.001
 #: What a request may ask for.
 PHASES = ("all", "pick", "place", "aside")
 
@@ -41,6 +43,7 @@ class GraspRequest:
             object away from where it is, so that what it hides or blocks comes free.
         place_yaw: Of the object's x axis about the base z, rad (half a turn makes no difference); None: unconstrained.
         timeout: s of robot time for all of it; 0: none.
+        velocity_scale: Share of the limits of the joints, 0.001 to 1; 0: that of the configuration.
         object_at: (x, y) near which the object is, base frame, m; None: any that is called so.
         exclude_near: (x, y) of objects that stay where they are, base frame, m.
         exclude_parts: (n, 2) where points of others are that do, base frame, m.
@@ -57,6 +60,7 @@ class GraspRequest:
     phase: str = "all"
     place_yaw: float | None = None
     timeout: float = 0.0
+    velocity_scale: float = 0.0
     object_at: tuple[float, ...] | None = None
     exclude_near: tuple[Spot, ...] = ()
     exclude_parts: tuple[Array, ...] = ()
@@ -86,7 +90,7 @@ class GraspRequest:
         return replace(self, label=label, arm=arm, phase=phase)
 
     def check(self, arms: Collection[str]) -> None:
-        """Refuse an arm or a phase that does not exist, and a long text.
+        """Refuse an arm, a phase or a speed that does not exist, and a long text.
 
         Args:
             arms: Of the robot.
@@ -101,6 +105,9 @@ class GraspRequest:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"phase {self.phase!r} does not exist; valid: {', '.join(PHASES)}"
             )
+        if not (self.velocity_scale == 0.0 or LEAST_SCALE <= self.velocity_scale <= 1.0):
+            scale = f"velocity_scale is {self.velocity_scale:g}"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{scale}, expected {LEAST_SCALE:g} to 1, or 0 for the usual one")
 
 
 def command(requests: Sequence[GraspRequest]) -> str:
@@ -124,6 +131,8 @@ def command(requests: Sequence[GraspRequest]) -> str:
         words += ["--phase", first.phase]
     if first.timeout:
         words += ["--time-limit", f"{first.timeout:g}"]
+    if first.velocity_scale:
+        words += ["--speed", f"{first.velocity_scale:g}"]
     return shlex.join([*words, *(["--dry-run"] if first.dry_run else [])])
 
 

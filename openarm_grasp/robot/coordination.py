@@ -56,7 +56,7 @@ class CoordinatedRobot:
         self._robot, self._coordination, self._config = robot, coordination, config
         self._other = next(name for name in robot.description.arm_names if name != arm)
         self._homes = {a: robot.description.group_state(f"{a}_arm", config.home_state) for a in (arm, self._other)}
-        self.deadline_ns = 0
+        self.deadline_ns, self.velocity_scale = 0, robot.velocity_scale
 
     def __getattr__(self, name: str) -> Any:
         """What is the same for an arm alone."""
@@ -64,7 +64,7 @@ class CoordinatedRobot:
 
     def check(self) -> None:
         """Raise when the work may not go on."""
-        self._robot.deadline_ns = self.deadline_ns
+        self._robot.deadline_ns, self._robot.velocity_scale = self.deadline_ns, self.velocity_scale
         self._robot.check()
 
     def warn(self, text: str) -> None:

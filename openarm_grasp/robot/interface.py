@@ -115,6 +115,9 @@ class RobotInterface(Protocol):
     deadline_ns: int
     """Robot time after which `check` raises CANCELLED; 0: none."""
 
+    velocity_scale: float
+    """Share of the limits of the joints that motions take; 0: the planner's default."""
+
     @property
     def now_ns(self) -> int:
         """Robot time."""

@@ -116,6 +116,7 @@ class GraspClient(BackgroundNode):
         dry_run: bool = False,
         confirm: OnPlan | bool = False,
         time_limit: float = 0.0,
+        speed: float = 0.0,
         timeout: float = 300.0,
         on_feedback: OnFeedback | None = None,
     ) -> GraspResult:
@@ -137,6 +138,7 @@ class GraspClient(BackgroundNode):
                 `arm`, and `reason` in a sentence); whether that plan is executed. True: plans wait for somebody else,
                 who calls `confirm` or /grasp/confirm. False: nothing waits.
             time_limit: s of robot time; then it ends with TIMEOUT, the hand keeping what it holds. 0: none.
+            speed: Share of the limits of the joints, 0.001 to 1; 0: that of the grasp node.
             timeout: s of wall clock; then the grasp is cancelled.
             on_feedback: Called with each `GraspStatus`, in the background thread; it may call `cancel`.
 
@@ -147,7 +149,7 @@ class GraspClient(BackgroundNode):
             OpenArmError: NOT_READY, when no grasp node answers; TIMEOUT; INVALID_ARGUMENT, for a place that is not two
                 or three numbers.
         """
-        goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit)
+        goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit, velocity_scale=speed)
         _where(goal, place, place_yaw, object_at)
         goal.exclude_near = [point((p[0], p[1], 0.0)) for p in exclude_near]
         goal.place_choices = [point((p[0], p[1], 0.0)) for p in place_choices]
@@ -178,6 +180,7 @@ class GraspClient(BackgroundNode):
         *,
         dry_run: bool = False,
         time_limit: float = 0.0,
+        speed: float = 0.0,
         timeout: float = 300.0,
         on_feedback: OnFeedback | None = None,
     ) -> PairResult:
@@ -188,6 +191,7 @@ class GraspClient(BackgroundNode):
             second: Another.
             dry_run: Plan and report, do not move.
             time_limit: s of robot time for both; then they end with TIMEOUT, hands keeping what they hold. 0: none.
+            speed: Share of the limits of the joints, 0.001 to 1; 0: that of the grasp node.
             timeout: s of wall clock; then both are cancelled.
             on_feedback: Called with each `GraspStatus`, which says of what label and arm it is, in the background
                 thread; it may call `cancel`.
@@ -198,7 +202,7 @@ class GraspClient(BackgroundNode):
         Raises:
             OpenArmError: As `pick`.
         """
-        goal = PickTwo.Goal(dry_run=dry_run, timeout=time_limit)
+        goal = PickTwo.Goal(dry_run=dry_run, timeout=time_limit, velocity_scale=speed)
         for request, wanted in zip(goal.requests, (first, second), strict=True):
             asked = GraspRequest(wanted) if isinstance(wanted, str) else wanted
             request.label, request.arm = asked.label, asked.arm

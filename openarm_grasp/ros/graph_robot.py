@@ -50,7 +50,7 @@ class GraphRobot:
         self._grippers = {
             arm: ActionClient(node, kind, config.gripper.format(arm=arm)) for arm in node.description.arm_names
         }
-        self.deadline_ns = 0
+        self.deadline_ns, self.velocity_scale = 0, config.velocity_scale
         #: Longest start delay of a motion until the other arm leaves clearance, s; 0: the arms never move at once.
         self.max_start_delay = 0.0
 
@@ -213,7 +213,7 @@ class GraphRobot:
     # --- planning and moving
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Ask /motion/plan_approach."""
-        goal = messages.plan_goal(request, self._config.velocity_scale)
+        goal = messages.plan_goal(request, self.velocity_scale)
         what = f"{request.arm} arm: planning"
         result = await self._nodes.goal(self._plan, goal, self._config.limits.plan_timeout, what, self._watched(None))
         return messages.planned_from_msg(result, len(goal.targets))
@@ -253,9 +253,7 @@ class GraphRobot:
         self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
     ) -> None:
         """Ask /motion/move."""
-        goal = messages.move_goal(
-            arm, self.base_frame, to, obstacles, self._config.velocity_scale, self.max_start_delay
-        )
+        goal = messages.move_goal(arm, self.base_frame, to, obstacles, self.velocity_scale, self.max_start_delay)
         goal.plan_only = plan_only
         await self._moved(arm, self._move, goal, what)
 

@@ -54,6 +54,7 @@ def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
         confirm=message.confirm,
         phase=message.phase or "all",
         timeout=message.timeout,
+        velocity_scale=message.velocity_scale,
         exclude_near=tuple((p.x, p.y) for p in message.exclude_near),
         place_choices=tuple((p.x, p.y) for p in message.place_choices),
     )
@@ -61,7 +62,8 @@ def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
 
 def requests_from_msg(goal: PickTwo.Goal) -> tuple[GraspRequest, GraspRequest]:
     """Two requests at once."""
-    first, second = (replace(_request(item), dry_run=goal.dry_run, timeout=goal.timeout) for item in goal.requests)
+    run = {"dry_run": goal.dry_run, "timeout": goal.timeout, "velocity_scale": goal.velocity_scale}
+    first, second = (replace(_request(item), **run) for item in goal.requests)
     return first, second
 
 

@@ -28,6 +28,7 @@ async def aside(task: Task) -> GraspOutcome:
     request.check(robot.description.arm_names)
     run = Run(task, request, None)
     robot.set_deadline(request.timeout)
+    robot.set_speed(request.velocity_scale)
     try:
         found = await detect(run, f"asked to push {request.label or 'any object'!r} aside")
         outcome = await _pushed(run, found)

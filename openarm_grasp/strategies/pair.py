@@ -194,6 +194,7 @@ async def _observe_both(pair: Pair) -> list[Sighting]:
     """Both objects, from frames that show both. A dry run moves nothing."""
     context, robot = pair.session.context, pair.robot
     robot.set_deadline(pair.requests[0].timeout)
+    robot.set_speed(pair.requests[0].velocity_scale)
     if not pair.requests[0].dry_run:
         await robot.go_home(robot.description.arm_names, back_off_below=context.clear_of_objects)
     frames = (await robot.observe_in_base(context.config.detect.frames)).frames

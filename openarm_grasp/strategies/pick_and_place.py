@@ -71,6 +71,7 @@ async def pick_and_place(task: Task, request: GraspRequest) -> GraspOutcome:
     kept = session.to_place(request) if request.phase == "place" else None
     run = Run(task, replace(request, label=kept.sighting.target.label) if kept else request, kept)
     robot.set_deadline(request.timeout)
+    robot.set_speed(request.velocity_scale)
     try:
         outcome = await _attempts(run)
     except OpenArmError as error:

@@ -102,6 +102,41 @@ def test_an_object_stalls_the_finger_and_is_pressed_on() -> None:
     assert finger.targets[-1] == 0.0
 
 
+def test_fingers_that_an_object_stops_have_closed_before_the_command_is_at_its_end() -> None:
+    times = []
+    for stop in (0.040, 0.025, 0.002):
+        finger = Finger(stop=stop)
+        finger.start(0.0)
+        outcome = finger.run()
+        assert (outcome.stalled, outcome.reached_goal) == (True, False)
+        times.append((finger.t_ns - START) / 1e9)
+        met = (0.044 - stop) / 0.075
+        assert times[-1] == pytest.approx(met + GripperConfig().stall_time, abs=0.1)
+    assert times == sorted(times)
+
+
+def test_a_hand_that_presses_opens_from_where_its_fingers_are() -> None:
+    finger = Finger(stop=0.025)
+    finger.start(0.0)
+    finger.run()
+    finger.tick(100)
+    assert finger.targets[-1] == 0.0
+    began, finger.stop = finger.t_ns, -1.0
+    finger.start(0.044)
+    finger.tick()
+    assert finger.targets[-1] == pytest.approx(0.025, abs=0.001)
+    assert finger.run().reached_goal
+    assert (finger.t_ns - began) / 1e9 == pytest.approx((0.044 - 0.025) / 0.075, abs=0.1)
+
+
+def test_fingers_that_are_stopped_as_they_open_are_not_taken_for_stopped_before_they_push() -> None:
+    finger = Finger(position=0.010)
+    finger.start(0.044)
+    finger.tick(3)
+    assert not finger.outcomes
+    assert finger.run().reached_goal
+
+
 @pytest.mark.parametrize("lever", [0.09, -0.09])
 def test_a_hinge_moves_its_finger_as_a_slide_does(lever: float) -> None:
     lower, upper = sorted((0.0, 0.044 / lever))

@@ -198,7 +198,7 @@ class RecordedRobot:
         self.description = RobotDescription.load()
         self.states = RobotStateBuffer(self.description)
         self.base_frame = self.description.root
-        self.deadline_ns, self.cancelled = 0, ""
+        self.deadline_ns, self.velocity_scale, self.cancelled = 0, 0.0, ""
         self.watch: Callable[[], None] = lambda: None
         self._tick, self._calls = -1, 0
         self.together = together

@@ -146,7 +146,7 @@ class World(Skills):
         shoulders = {"left": (0.0, 0.15), "right": (0.0, -0.15)}
         looks = {"right": "wrist"} if self._config.near.enabled else {}
         self.session = GraspSession(GraspContext(self._config, robot_work().table, HAND, shoulders, looks))
-        self.deadline_ns = 0
+        self.deadline_ns, self.velocity_scale = 0, 0.0
         self.robot = self  # type: ignore[assignment]
         self._target, self._label, self._line = np.zeros(3), "", np.zeros(3)
 

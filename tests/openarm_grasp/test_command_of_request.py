@@ -11,7 +11,14 @@ from openarm_bringup.cli import build_app
 from openarm_grasp.requests.request import GraspRequest, command
 
 FULL = GraspRequest(
-    "red", arm="left", place=(0.25, -0.1), place_yaw=-0.5, phase="pick", timeout=30.0, object_at=(0.3, -0.2)
+    "red",
+    arm="left",
+    place=(0.25, -0.1),
+    place_yaw=-0.5,
+    phase="pick",
+    timeout=30.0,
+    velocity_scale=0.25,
+    object_at=(0.3, -0.2),
 )
 
 
@@ -32,3 +39,4 @@ def test_the_command_of_a_request_is_parsed_to_that_request(requests: tuple[Gras
     assert given.get("at") == ([(0.3, -0.2)] if requests == (FULL,) else None)
     assert given.get("phase", "all") == requests[0].phase
     assert given.get("time_limit", 0.0) == requests[0].timeout
+    assert given.get("speed", 0.0) == requests[0].velocity_scale

@@ -21,7 +21,7 @@ class Robot:
     def __init__(self) -> None:
         self.description = RobotDescription.load()
         self.states = self
-        self.now_ns, self.deadline_ns, self.steps, self.looks = 1, 0, 0, 0
+        self.now_ns, self.deadline_ns, self.steps, self.looks, self.velocity_scale = 1, 0, 0, 0, 0.0
         config = GraspConfig()
         self.q: dict[str, float] = {}
         for arm in ("left", "right"):

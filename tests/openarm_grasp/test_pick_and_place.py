@@ -10,9 +10,11 @@ import pytest
 
 from openarm_bringup import load_graph
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
 from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Observe, ToBase
+from tests.refusals import refused
 
 
 # --- success
@@ -41,14 +43,24 @@ def test_the_hand_opens_on_the_way_to_the_pregrasp(world):
 
 @pytest.mark.requirement("B-52", "B-53", "B-54")
 def test_pauses_are_those_of_the_graph_and_real_robots_have_some(worlds, box):
-    grasp = load_graph("real").nodes["grasp"].params
-    world = worlds(box("red", 0.26, -0.2), timing=grasp["timing"])
+    params = load_graph("real").nodes["grasp"].params
+    timing = {name: params[f"timing.{name}"] for name in ("pause_at_grasp", "after_close")}
+    world = worlds(box("red", 0.26, -0.2), timing=timing)
     world.grasp()
     (close,) = world.times(world.grips(opening=False))
     (arrive,) = world.times(world.follows_path("approach"))
     (lift,) = world.times(world.follows_path("lift"))
     assert close - (arrive + 1.0) == pytest.approx(0.5)  # the motion takes 1 s
     assert lift - (close + 0.6) == pytest.approx(0.2)  # the fingers take 0.6 s
+
+
+def test_a_request_has_its_own_speed_or_that_of_the_configuration(world):
+    for asked, taken in ((0.25, 0.25), (0.0, 1.0)):
+        world.succeeds(velocity_scale=asked)
+        assert world.velocity_scale == taken
+    for wrong in (-0.1, 1e-4, 1.5, float("nan")):
+        check = GraspRequest("red", velocity_scale=wrong).check
+        assert refused("expected 0.001 to 1", check, ("left", "right")).code is Code.INVALID_ARGUMENT
 
 
 @pytest.mark.requirement("B-71")
