@@ -20,6 +20,12 @@ _COLUMNS: Sequence[str] = (
     "attempts", "place_error_mm", "sim_s", "wall_s", "message", "again",
 )  # fmt: skip
 
+#: Scenes whose lines of time are drawn, and colours of the states.
+_LINES = 40
+_COLORS = {
+    "DETECT": "#4c78a8", "TRANSFORM": "#9ecae9", "PLAN": "#79706e", "MOVE_TO_PREGRASP": "#f58518",
+    "MOVE_TO_GRASP": "#ffbf79", "CLOSE_GRIPPER": "#b279a2", "LIFT": "#54a24b", "PLACE": "#88d27a", "RESET": "#e45756",
+}  # fmt: skip
 #: How far a grasp has come, by the state that it has entered.
 _STAGES = {
     "seen": "TRANSFORM",
@@ -44,7 +50,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     done = [grasp for grasp in grasps if grasp["placed"]]
     arms = sorted({grasp["arm"] for grasp in grasps} - {""})
     failed = [row for row in rows if not row["as_expected"]]
-    success = interval(len(placed), len(possible))
+    success, seconds = interval(len(placed), len(possible)), sum(float(row["sim_s"]) for row in rows)
     first = sum(row["attempts"] == 1 for row in placed)
     return {
         "n": len(rows),
@@ -70,6 +76,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         },
         "place_error_mm": spread(grasp["place_error_mm"] for grasp in done),
         "cycle_s": spread(grasp["sim_s"] for grasp in done),
+        "picks_per_hour": round(3600.0 * len(done) / seconds) if seconds > 0.0 else None,
         "state_s": _states(done),
     }
 
@@ -92,7 +99,6 @@ def _things(rows: Sequence[Row]) -> dict[str, Any]:
     wanted = {(id(row), name) for row, name, _ in can}
     tried = [g for row in rows for g in row["grasps"] if (id(row), g["target"]) in wanted]
     open_ = [g["code"] for row in rows if "things" in row for g in row["grasps"] if not g["placed"]]
-    seconds = sum(float(row["sim_s"]) for row in rows if "things" in row)
     return {
         "graspable": interval(len(can), len(found)),
         "cleared": rate_of((id(row), name) in placed for row, name, _ in can),
@@ -106,7 +112,6 @@ def _things(rows: Sequence[Row]) -> dict[str, Any]:
             "claimed": sum(bool(g.get("claimed_success")) for g in tried),
         },
         "refused": dict(Counter(open_).most_common()),
-        "picks_per_hour": round(3600.0 * len(placed) / seconds) if seconds > 0.0 else None,
     }
 
 
@@ -171,6 +176,7 @@ def figures(data: Mapping[str, Any]) -> list[tuple[str, str]]:
         if s[key]:
             v = s[key]
             out.append((name, f"median {v['median']:g}, p95 {v['p95']:g}, max {v['max']:g} {unit}"))
+    out.append(("objects placed in an hour of robot time, failures included", str(s["picks_per_hour"] or "none")))
     rate = data["scenes_per_hour"]
     speed = f", {rate} scenes an hour with {data['workers']} worker(s)" if rate else ""
     machine = data["machine"]
@@ -189,7 +195,6 @@ def _figures_of_things(s: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("grasps of graspable ones that got so far", ", ".join(f"{k} {v}" for k, v in s["reached"].items())),
         ("graspable ones not placed", ", ".join(missed) or "none"),
         ("answers where nothing was placed", ", ".join(f"{k}: {v}" for k, v in s["refused"].items()) or "none"),
-        ("objects placed in an hour of robot time", str(s["picks_per_hour"] or "none")),
     ]
 
 
@@ -209,9 +214,29 @@ def write_html(path: Path, data: Mapping[str, Any]) -> None:
         summary=data["summary"],
         figures=figures(data),
         rate=_rate,
+        lines=_time_lines(data["rows"][:_LINES]),
+        colors=_COLORS,
         failures=[(row, pictures) for row, pictures in failures if pictures and not row["as_expected"]],
     )
     path.write_text(page, encoding="utf-8")
+
+
+def _time_lines(rows: Sequence[Row]) -> list[tuple[str, list[tuple[str, float, float, str]]]]:
+    """Lines of time, by scene and arm, whose lengths compare: state, begin and length in %, and what to show of each."""
+    lines: dict[str, list[tuple[str, float, float]]] = defaultdict(list)
+    for row in rows:
+        first = min((grasp.get("began_s", 0.0) for grasp in row["grasps"]), default=0.0)
+        for grasp in row["grasps"]:
+            at = grasp.get("began_s", 0.0) - first
+            for step in grasp.get("states", ()):
+                lines[f"{row['seed']} {grasp['arm']}"].append((step["state"], at, float(step["seconds"])))
+                at += float(step["seconds"])
+    longest = max((at + s for line in lines.values() for _, at, s in line), default=0.0) or 1.0
+    share = 100.0 / longest
+    return [
+        (name, [(state, share * at, share * s, f"{state} {s:.2f} s from {at:.2f} s") for state, at, s in line])
+        for name, line in lines.items()
+    ]
 
 
 def _pictures(campaign: Path, folder: str) -> list[str]:

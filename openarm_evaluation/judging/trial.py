@@ -107,6 +107,7 @@ class Trial:
             "rise_mm": round(verdict.rise * 1e3, 1) if verdict else None,
             "tilt_deg": round(math.degrees(verdict.tilt), 2) if verdict else None,
             "sim_s": round(self.sim_s, 2),
+            "began_s": round(self.steps[0].t_ns * 1e-9, 3) if self.steps else 0.0,
             "wall_s": round(self.wall_s, 2),
             "states": [
                 {
