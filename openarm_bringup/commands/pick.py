@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from openarm_interfaces.msg import GraspStatus
 
     from openarm_grasp.planning.options import Option
+    from openarm_grasp.requests.request import GraspRequest
     from openarm_grasp.requests.state_times import StateTime
-    from openarm_grasp.ros.client import GraspResult, PairResult
+    from openarm_grasp.ros.client import GraspClient, GraspResult, PairResult
 
 
 T = TypeVar("T")
@@ -212,6 +213,29 @@ def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
     return Outcome(result.success, result.message, result.code, data, text + _kept(result.recording))
 
 
+def _answers(
+    client: GraspClient, asked: tuple[GraspRequest, ...], speed: float, timeout: float
+) -> Sequence[GraspResult]:
+    """Return what came of one request, or of each of two."""
+    if len(asked) == 2:
+        from openarm_grasp.ros.client import GraspResult
+
+        both = client.pick_two(*asked, speed=speed, timeout=timeout)
+        none = (both.code, both.message, both.outcome)
+        return both.results or [GraspResult(False, *none, ask.label, "", 0, (0.0, 0.0, 0.0), 0.0) for ask in asked]
+    (ask,) = asked
+    result = client.pick(
+        ask.label,
+        phase=ask.phase,
+        object_at=ask.object_at,
+        exclude_near=ask.exclude_near,
+        place_choices=ask.place_choices,
+        speed=speed,
+        timeout=timeout,
+    )
+    return (result,)
+
+
 def order(
     *labels: str,
     bins: Path | None = None,
@@ -221,6 +245,8 @@ def order(
     timeout: float = 300.0,
 ) -> Outcome:
     """Pick several objects of the running graph and place them, until nothing is left or nothing can be done.
+
+    Both arms work at once where there is room for both.
 
     `openarm order anything` clears the table, `openarm order red` takes all that is red; the easiest comes first. What
     cannot be taken is tried again when something else has been taken away, and listed at the end with the reason. With
@@ -235,32 +261,28 @@ def order(
     """
     from openarm_grasp.requests.orders import Order, load_bins
 
-    work = Order(labels, load_bins(bins) if bins is not None else None, each)
     join_graph(domain)
+    from openarm_common.robot.description import RobotDescription
     from openarm_grasp.ros.client import GraspClient
 
+    arms = min(2, len(RobotDescription.load().arm_names))
+    work = Order(labels, load_bins(bins) if bins is not None else None, each, arms)
     shown, results = console(), list[dict[str, Any]]()
     with requires_node("grasp", "sim"), GraspClient() as client:
-        while ask := work.next():
+        while asked := work.next():
             try:
-                result = client.pick(
-                    ask.label,
-                    phase=ask.phase,
-                    object_at=ask.object_at,
-                    exclude_near=ask.exclude_near,
-                    place_choices=ask.place_choices,
-                    speed=speed,
-                    timeout=timeout,
-                )
+                answers = _answers(client, asked, speed, timeout)
             except KeyboardInterrupt:
                 data = {"placed": work.placed, "results": results}
-                return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED, data)
-            seen = result.object_position
-            how = {"touched": result.attempts > 0, "held": result.outcome == "PARTIAL"}
-            work.done(ask, result.code, result.message, result.place_position, seen, **how)
-            row = {"label": ask.label, "position": seen and list(seen), "code": result.code, "message": result.message}
-            results.append({**row, "place": list(result.place_position) if result.success else None})
-            shown.print(f"{ask.label}: {result.code}: {result.message}", markup=False)
+                return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, data)
+            for ask, result in zip(asked, answers, strict=True):
+                seen = result.object_position
+                how = {"touched": result.attempts > 0, "held": result.outcome == "PARTIAL"}
+                work.done(ask, result.code, result.message, result.place_position, seen, **how)
+                row = {"label": ask.label, "position": seen and list(seen), "code": result.code}
+                place = list(result.place_position) if result.success else None
+                results.append({**row, "message": result.message, "place": place})
+                shown.print(f"{ask.label}: {result.code}: {result.message}", markup=False)
     faults = work.faults()
     left = [{**asdict(one), "code": str(one.code)} for one in work.left]
     data = {"outcome": work.outcome, "placed": work.placed, "left": left, "faults": list(faults), "results": results}

@@ -222,7 +222,7 @@ def write_html(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def _time_lines(rows: Sequence[Row]) -> list[tuple[str, list[tuple[str, float, float, str]]]]:
-    """Lines of time, by scene and arm, whose lengths compare: state, begin and length in %, and what to show of each."""
+    """Lines of time by scene and arm, all to one scale: state, begin and length in %, and what to show of each."""
     lines: dict[str, list[tuple[str, float, float]]] = defaultdict(list)
     for row in rows:
         first = min((grasp.get("began_s", 0.0) for grasp in row["grasps"]), default=0.0)

@@ -94,8 +94,6 @@ class Trials:
         self._faulty = False
         #: Whether the fault of the task has begun.
         self.injected = False
-        #: Where the newest object was placed, and where it was seen before.
-        self._ends: tuple[tuple[float, ...], tuple[float, ...] | None] = ((), None)
         #: Robot time of the requests of an order, s, and what it left, a sentence each.
         self._seconds = 0.0
         self._left: tuple[str, ...] = ()
@@ -107,7 +105,8 @@ class Trials:
         self._begin_fault("")
         clearance = watch_clearance(self.robot) if self._task.set_name.startswith("pairs") else None
         began_ns = self.robot.t_ns
-        trials = self._both() if self._task.together else self._all_in_turn()
+        pair = self._task.together and not self._task.clear
+        trials = self._both([GraspRequest(label) for label in self._task.labels]) if pair else self._all_in_turn()
         row = row_of(self._task, trials, time.monotonic() - began)
         row["again"], row["left"] = self._again, list(self._left)
         row["sim_s"] = round(self._seconds, 2) or row["sim_s"]
@@ -123,25 +122,33 @@ class Trials:
         labels, clear = self._task.labels, self._task.clear
         if not clear and len(set(labels)) < len(labels):  # the same object more than once
             return [self._grasp(GraspRequest(label)) for label in labels]
-        order, placed, open_ = Order(labels, each=0 if clear else Counter(labels)), list[Trial](), dict[object, Trial]()
-        while ask := order.next():
-            trial = self._grasp(ask)
-            answer, touched = trial.answer, trial.answer.attempts > 0
-            held = isinstance(answer, GraspOutcome) and answer.held
-            left = order.done(ask, Code(answer.code), answer.message, *self._ends, touched=touched, held=held)
-            self._seconds += trial.sim_s
-            if ask.phase == "aside":
-                continue
-            if answer.success:
-                placed.append(trial)
-                continue
-            label = order.label_of(ask)
-            if left is not None:
-                open_[left] = trial
-            elif all(one.label != label for one in order.left):  # else it says of nothing new that it is not in view
-                open_[label] = trial
-            if touched and not clear:  # three attempts are what a scene may take
-                order.failed[label] = answer.message
+        arms = 2 if self._task.together else 1
+        order, placed, open_ = (
+            Order(labels, each=0 if clear else Counter(labels), arms=arms),
+            list[Trial](),
+            dict[object, Trial](),
+        )
+        while asked := order.next():
+            trials = [self._grasp(*asked)] if len(asked) == 1 else self._both(asked)
+            began_ns = min(step.t_ns for trial in trials for step in trial.steps[:1])
+            self._seconds += (max(step.t_ns for trial in trials for step in trial.steps[-1:]) - began_ns) * 1e-9
+            for ask, trial in zip(asked, trials, strict=True):
+                answer, touched = trial.answer, trial.answer.attempts > 0
+                held = isinstance(answer, GraspOutcome) and answer.held
+                ends = answer.place_position, answer.object_position
+                left = order.done(ask, Code(answer.code), answer.message, *ends, touched=touched, held=held)
+                if ask.phase == "aside":
+                    continue
+                if answer.success:
+                    placed.append(trial)
+                    continue
+                label = order.label_of(ask)
+                if left is not None:
+                    open_[left] = trial
+                elif all(one.label != label for one in order.left):  # else it says of nothing new that it isn't in view
+                    open_[label] = trial
+                if touched and not clear:  # three attempts are what a scene may take
+                    order.failed[label] = answer.message
         # what was taken twice does not count for two
         done = len({trial.target for trial in placed}) if clear else len(placed)
         self._left, missing = order.faults(), len(labels) - done
@@ -150,24 +157,24 @@ class Trials:
         return [*placed, *(last + last[-1:] * missing)[:missing]]
 
     def _grasp(self, ask: GraspRequest) -> Trial:
-        robot, task = self.robot, self._task
-        began, first = time.monotonic(), len(self.steps)
-        if ask.phase != "place":  # what is held has risen before
-            for track in robot.tracks.values():
-                track.clear()
-        robot.pass_time(0.1)
+        task, began, first = self._task, time.monotonic(), len(self.steps)
+        self._begin(lifted=ask.phase == "place")
         request = replace(ask, arm=task.arm, place=task.place)
         try:
             outcome = self.link.run(carry_out(self.grasp_task(request)))
         except OpenArmError as error:
             outcome = GraspOutcome(error.code, error.message, ask.label)
         wall_s = time.monotonic() - began
-        self._ends = (outcome.place_position, outcome.object_position)
         return self._trial(ask.label, outcome, self.steps[first:], wall_s)
 
-    def _both(self) -> list[Trial]:
+    def _begin(self, *, lifted: bool = False) -> None:
+        """Forget how objects have moved; what is held has been lifted before."""
+        for track in () if lifted else self.robot.tracks.values():
+            track.clear()
+        self.robot.pass_time(0.1)
+
+    def _both(self, asked: Sequence[GraspRequest]) -> list[Trial]:
         """Ask for two objects at once, of both arms."""
-        robot, task = self.robot, self._task
         began = time.monotonic()
         steps: tuple[list[Step], list[Step]] = ([], [])
 
@@ -176,16 +183,16 @@ class Trials:
             steps[status.request].append(self.steps[-1])
 
         robots: dict[str, RobotInterface] = {arm: self.link.next_to_other() for arm in self.robot.description.arm_names}
-        requests = (GraspRequest(task.labels[0]), GraspRequest(task.labels[1]))
-        pair = Pair(self.session, self.skills, robots, requests, report, carry_out)
-        robot.pass_time(0.1)
+        first, second = asked
+        pair = Pair(self.session, self.skills, robots, (first, second), report, carry_out)
+        self._begin()
         outcomes: Sequence[GraspOutcome]
         try:
             outcomes = self.link.run(carry_out_pair(pair)).answers
         except OpenArmError as error:
-            outcomes = [GraspOutcome(error.code, error.message, label) for label in task.labels]
-        wall_s = 0.5 * (time.monotonic() - began)
-        return [self._trial(*each, wall_s) for each in zip(task.labels, outcomes, steps, strict=True)]
+            outcomes = [GraspOutcome(error.code, error.message, ask.label) for ask in asked]
+        wall_s, labels = 0.5 * (time.monotonic() - began), [ask.label for ask in asked]
+        return [self._trial(*each, wall_s) for each in zip(labels, outcomes, steps, strict=True)]
 
     def grasp_task(self, request: GraspRequest) -> GraspTask:
         """A request, to be carried out by a strategy."""

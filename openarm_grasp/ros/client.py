@@ -150,9 +150,15 @@ class GraspClient(BackgroundNode):
                 or three numbers.
         """
         goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit, velocity_scale=speed)
-        _where(goal, place, place_yaw, object_at)
-        goal.exclude_near = [point((p[0], p[1], 0.0)) for p in exclude_near]
-        goal.place_choices = [point((p[0], p[1], 0.0)) for p in place_choices]
+        asked = GraspRequest(
+            label,
+            place=None if place is None else tuple(place),
+            place_yaw=place_yaw,
+            object_at=None if object_at is None else tuple(object_at),
+            exclude_near=tuple((p[0], p[1]) for p in exclude_near),
+            place_choices=tuple((p[0], p[1]) for p in place_choices),
+        )
+        _where(goal, asked)
         goal.confirm = bool(confirm)
         return _result(self._ask(Pick, "/grasp/pick", goal, timeout, on_feedback, confirm))
 
@@ -187,7 +193,7 @@ class GraspClient(BackgroundNode):
         """Pick two objects and place them, with both arms at the same time where planning allows that.
 
         Args:
-            first: A label, or a request with label, arm, place, place_yaw and object_at.
+            first: A label, or a request with label, arm, place, place_yaw, object_at, exclude_near and place_choices.
             second: Another.
             dry_run: Plan and report, do not move.
             time_limit: s of robot time for both; then they end with TIMEOUT, hands keeping what they hold. 0: none.
@@ -206,7 +212,7 @@ class GraspClient(BackgroundNode):
         for request, wanted in zip(goal.requests, (first, second), strict=True):
             asked = GraspRequest(wanted) if isinstance(wanted, str) else wanted
             request.label, request.arm = asked.label, asked.arm
-            _where(request, asked.place, asked.place_yaw, asked.object_at)
+            _where(request, asked)
         answer: PickTwo.Result = self._ask(PickTwo, "/grasp/pick_two", goal, timeout, on_feedback)
         results = tuple(_result(one) for one in answer.results)
         return PairResult(**_same(answer, "simultaneous", "recording"), results=results)
@@ -247,22 +253,20 @@ def _answer(message: ConfirmPlan.Response | ReleaseHand.Response) -> Answer:
     return Answer(message.success, code, message.message)
 
 
-def _where(
-    request: Pick.Goal | PickRequest,
-    place: Sequence[float] | None,
-    place_yaw: float | None,
-    object_at: Sequence[float] | None,
-) -> None:
+def _where(message: Pick.Goal | PickRequest, asked: GraspRequest) -> None:
     """Fill in where an object stands and where it should be placed."""
-    if place_yaw is not None:
-        request.has_place_yaw, request.place_yaw = True, place_yaw
-    if place is not None:
+    if asked.place_yaw is not None:
+        message.has_place_yaw, message.place_yaw = True, asked.place_yaw
+    if (place := asked.place) is not None:
         if len(place) not in (2, 3):
             raise OpenArmError(Code.INVALID_ARGUMENT, f"place {list(place)} must be x, y or x, y, z in metres")
-        request.has_place_position = True
-        request.place_position = point((place[0], place[1], place[2] if len(place) == 3 else 0.0))
-    if object_at is not None:
-        request.has_object_position, request.object_position = True, point((object_at[0], object_at[1], 0.0))
+        message.has_place_position = True
+        message.place_position = point((place[0], place[1], place[2] if len(place) == 3 else 0.0))
+    if (at := asked.object_at) is not None:
+        message.has_object_position, message.object_position = True, point((at[0], at[1], 0.0))
+    message.exclude_near, message.place_choices = (
+        [point((x, y, 0.0)) for x, y in spots] for spots in (asked.exclude_near, asked.place_choices)
+    )
 
 
 def _result(message: Pick.Result | PickResult) -> GraspResult:

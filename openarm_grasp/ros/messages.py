@@ -55,8 +55,6 @@ def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
         phase=message.phase or "all",
         timeout=message.timeout,
         velocity_scale=message.velocity_scale,
-        exclude_near=tuple((p.x, p.y) for p in message.exclude_near),
-        place_choices=tuple((p.x, p.y) for p in message.place_choices),
     )
 
 
@@ -76,6 +74,8 @@ def _request(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
         place=(p.x, p.y, p.z) if message.has_place_position else None,
         place_yaw=message.place_yaw if message.has_place_yaw else None,
         object_at=(at.x, at.y) if message.has_object_position else None,
+        exclude_near=tuple((p.x, p.y) for p in message.exclude_near),
+        place_choices=tuple((p.x, p.y) for p in message.place_choices),
     )
 
 

@@ -7,9 +7,10 @@ to each other that the arms would only wait, the objects are picked one after th
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import islice, permutations
 
 import numpy as np
 
@@ -31,6 +32,8 @@ Requests = tuple[GraspRequest, GraspRequest]
 _APART = 0.20
 #: Detections nearer to each other than this are one object, m.
 _ONE = 0.005
+#: Pairs of objects that are tried where words fit several.
+_TRIED = 4
 #: These end a request, and one that runs concurrently; no other strategy is tried.
 ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST, Code.STOPPED)
 
@@ -152,6 +155,8 @@ async def in_turn(pair: Pair) -> PairOutcome:
         text = f"not begun: {first.label!r} ended with {first.code}: {first.message}"
         second = GraspOutcome(first.code, text, pair.requests[1].label)
     else:
+        if first.success:  # words that fit both are not for what was placed
+            pair.requests = (pair.requests[0], pair.requests[1].without(first.place_position[:2]))
         second = await pair.alone(1)
     return pair.answer((first, second), simultaneous=False)
 
@@ -166,57 +171,79 @@ async def _arms_for_both(pair: Pair) -> tuple[tuple[str, ...], str]:
     if len(places) == 2 and float(np.hypot(*(np.subtract(places[0][:2], places[1][:2])))) < _APART:
         return (), "the places are close to each other: one after the other"
     try:
-        found = await _observe_both(pair)
+        frames = await _observe(pair)
+        candidates = list(islice(_pairs(requests, frames, pair.session.context.config.detect), _TRIED))
     except OpenArmError as error:
         if error.code not in ENDS:
             return (), f"{error.message}: one after the other"
         if error.code is Code.CANCELLED:
             pair.task(0, pair.robot)  # a deadline ends work as a cancel does; here it gets its own name
         raise
-    faults: list[str] = []
+    faults: dict[str, None] = {}
+    for first, second in candidates:
+        arms, fault = await _assigned(pair, (first, second))
+        if arms:
+            pair.requests = (requests[0].about(first), requests[1].about(second))
+            return arms, f"both at once: {first.target.label!r} {arms[0]}, {second.target.label!r} {arms[1]}"
+        faults[fault] = None
+    first, second = candidates[0]
+    pair.requests = (requests[0].about(first), requests[1].about(second))
+    return (), f"not both at once ({'; '.join(faults)}): one after the other"
+
+
+async def _assigned(pair: Pair, found: tuple[Sighting, Sighting]) -> tuple[tuple[str, ...], str]:
+    """An arm for each object; none, with the reason, where they cannot be picked at the same time."""
+    context, faults = pair.session.context, list[str]()
+    shoulders = context.shoulders
 
     def crossing(arms: tuple[str, str]) -> float:
         """Least for the arms that stand on the sides of their objects."""
         return -sum(shoulders[arm][1] * float(one.target.p_base[1]) for arm, one in zip(arms, found, strict=True))
 
+    standing = [replace(one, target=on_table(one.target, context.table.top_z)) for one in found]
     for arms in sorted(permutations(shoulders, 2), key=crossing):
-        asked = [request.arm in ("", "auto", arm) for request, arm in zip(requests, arms, strict=True)]
-        if not all(asked):
-            continue
-        fault = await _fault(pair, found, arms)
-        if not fault:
-            return arms, f"both at once: {requests[0].label!r} {arms[0]}, {requests[1].label!r} {arms[1]}"
-        faults.append(fault)
-    return (), f"not both at once ({'; '.join(faults) or 'the same arm is asked for'}): one after the other"
+        if all(request.arm in ("", "auto", arm) for request, arm in zip(pair.requests, arms, strict=True)):
+            fault = await _fault(pair, standing, arms)
+            if not fault:
+                return arms, ""
+            faults.append(fault)
+    return (), "; ".join(faults) or "the same arm is asked for"
 
 
-async def _observe_both(pair: Pair) -> list[Sighting]:
-    """Both objects, from frames that show both. A dry run moves nothing."""
+async def _observe(pair: Pair) -> tuple[Frame, ...]:
+    """Frames of both objects. A dry run moves nothing."""
     context, robot = pair.session.context, pair.robot
     robot.set_deadline(pair.requests[0].timeout)
     robot.set_speed(pair.requests[0].velocity_scale)
     if not pair.requests[0].dry_run:
         await robot.go_home(robot.description.arm_names, back_off_below=context.clear_of_objects)
-    frames = (await robot.observe_in_base(context.config.detect.frames)).frames
-    first, second = (request.find(frames, context.config.detect) for request in pair.requests)
-    if apart(first.target, second.target) <= _ONE:
-        first, second = _two_of(pair.requests, frames, context.config.detect, first)
-    pair.requests = (pair.requests[0].about(first), pair.requests[1].about(second))
-    return [replace(one, target=on_table(one.target, context.table.top_z)) for one in (first, second)]
+    return (await robot.observe_in_base(context.config.detect.frames)).frames
 
 
-def _two_of(requests: Requests, frames: Sequence[Frame], limits: DetectConfig, one: Sighting) -> Sequence[Sighting]:
-    """Two objects, where the words of both requests fit the same one first.
+def _pairs(requests: Requests, frames: Sequence[Frame], limits: DetectConfig) -> Iterator[tuple[Sighting, Sighting]]:
+    """Two objects, the best for each request first; then others that the words of the second request fit.
 
     Raises:
-        OpenArmError: UNKNOWN_OBJECT, when neither fits another.
+        OpenArmError: As `GraspRequest.find`; UNKNOWN_OBJECT, when both requests fit one object alone.
     """
-    taken = ((float(one.target.p_base[0]), float(one.target.p_base[1])),)
-    first, second = (replace(request, exclude_near=(*request.exclude_near, *taken)) for request in requests)
-    try:
-        return one, second.find(frames, limits)
-    except OpenArmError:
-        return first.find(frames, limits), one
+    first, second = (request.find(frames, limits) for request in requests)
+    if apart(first.target, second.target) <= _ONE:
+        others = [request.without(_spot(first)) for request in requests]
+        try:
+            second = others[1].find(frames, limits)
+        except OpenArmError:
+            first, second = others[0].find(frames, limits), first
+    left = requests[1].without(_spot(first))
+    with suppress(OpenArmError):
+        while True:
+            yield first, second
+            left = left.without(_spot(second))
+            second = left.find(frames, limits)
+
+
+def _spot(found: Sighting) -> tuple[float, float]:
+    x, y = found.target.p_base[:2]
+    return float(x), float(y)
 
 
 async def _fault(pair: Pair, found: Sequence[Sighting], arms: tuple[str, str]) -> str:
@@ -245,13 +272,8 @@ def check_pair(requests: Requests, arms: Collection[str]) -> None:
     if not first.label or not second.label:
         labels = f"{first.label!r} and {second.label!r}"
         raise OpenArmError(Code.INVALID_ARGUMENT, f"two at once need a label each, got {labels}")
-    if first.label != second.label:
+    if first.label != second.label or first.object_at is None or second.object_at is None:
         return
-    if first.object_at is None or second.object_at is None:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT,
-            f"{first.label!r} is asked for twice: say of each where it stands, or ask for another object",
-        )
     apart = float(np.hypot(*np.subtract(first.object_at[:2], second.object_at[:2])))
     if apart <= 2.0 * SAME_PLACE:
         raise OpenArmError(

@@ -8,7 +8,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_evaluation.campaign.tasks.faults import fault_task
 from openarm_evaluation.campaign.tasks.task import Task, clutter, endurance, nominal
 from openarm_evaluation.campaign.tasks.things import THINGS, heap_task, objects_task
-from openarm_evaluation.campaign.tasks.two_arms import handover_task, in_turn_task, pair_task, push_task
+from openarm_evaluation.campaign.tasks.two_arms import handover_task, in_turn_task, order_task, pair_task, push_task
 
 #: Makers of tasks by the name of the suite.
 SUITES = {
@@ -20,11 +20,12 @@ SUITES = {
     "push": push_task,
     "pairs": pair_task,
     "pairs_in_turn": in_turn_task,
+    "orders": order_task,
     "objects": objects_task,
     "heap": heap_task,
 }
 #: Those that two arms share, or whose objects stand between two arms.
-OF_TWO_ARMS = ("handover", "push", "pairs", "pairs_in_turn")
+OF_TWO_ARMS = ("handover", "push", "pairs", "pairs_in_turn", "orders")
 
 
 def make_task(set_name: str, seed: int, objects: str = "") -> Task:

@@ -59,7 +59,7 @@ class Task:
         posture: Joints that start elsewhere than at home, rad by name.
         clear: Repeated labels are several objects: what was placed stays where it is.
         route: By which it must come to its place, as `GraspOutcome.route`; "": any.
-        together: Both labels are requested simultaneously, of both arms.
+        together: Two labels are requested at once, of both arms.
         graspable: Of objects of any shape by name: why a hand can't take it, as the judge decides; "" where it can.
     """
 

@@ -22,7 +22,7 @@ from openarm_common.scene.scene import PALETTE, Scene, SceneObject, parse_scene,
 from openarm_common.types import Array
 from openarm_evaluation.campaign.in_process_robot import approach_of
 from openarm_evaluation.campaign.robot import arms_behind
-from openarm_evaluation.campaign.tasks.task import Task, past, within
+from openarm_evaluation.campaign.tasks.task import Task, crowded_scene, past, within
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.sightings import standing_at
@@ -42,6 +42,8 @@ _APART = 0.13
 #: An object to push stands at most this much past the region, m.
 _FARTHER = 0.16
 _REGION = "work.region of robot.yaml"
+#: Objects of an order.
+_ORDERED = 6
 
 
 def handover_task(seed: int) -> Task:
@@ -86,6 +88,13 @@ def pair_task(seed: int) -> Task:
 def in_turn_task(seed: int) -> Task:
     """Request the same one after the other, to compare the time of a pair."""
     return replace(pair_task(seed), set_name="pairs_in_turn", kind="pair in turn", together=False)
+
+
+def order_task(seed: int) -> Task:
+    """Request all of six objects of one order, which both arms carry out."""
+    scene = crowded_scene(seed, _ORDERED)
+    labels = ("anything",) * _ORDERED
+    return Task("orders", seed, scene, labels, kind="order", clear=True, together=True)
 
 
 def push_task(seed: int) -> Task:
