@@ -265,11 +265,13 @@ def order(
     from openarm_common.robot.description import RobotDescription
     from openarm_grasp.ros.client import GraspClient
 
-    arms = min(2, len(RobotDescription.load().arm_names))
-    work = Order(labels, load_bins(bins) if bins is not None else None, each, arms)
+    work = Order(labels, load_bins(bins) if bins is not None else None, each)
+    both = len(RobotDescription.load().arm_names) > 1
     shown, results = console(), list[dict[str, Any]]()
     with requires_node("grasp", "sim"), GraspClient() as client:
-        while asked := work.next():
+        while first := work.next():
+            other = work.next_to(first) if both else None
+            asked = (first,) if other is None else (first, other)
             try:
                 answers = _answers(client, asked, speed, timeout)
             except KeyboardInterrupt:

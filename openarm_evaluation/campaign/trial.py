@@ -122,14 +122,11 @@ class Trials:
         labels, clear = self._task.labels, self._task.clear
         if not clear and len(set(labels)) < len(labels):  # the same object more than once
             return [self._grasp(GraspRequest(label)) for label in labels]
-        arms = 2 if self._task.together else 1
-        order, placed, open_ = (
-            Order(labels, each=0 if clear else Counter(labels), arms=arms),
-            list[Trial](),
-            dict[object, Trial](),
-        )
-        while asked := order.next():
-            trials = [self._grasp(*asked)] if len(asked) == 1 else self._both(asked)
+        order, placed, open_ = Order(labels, each=0 if clear else Counter(labels)), list[Trial](), dict[object, Trial]()
+        while first := order.next():
+            other = order.next_to(first) if self._task.together else None
+            asked = (first,) if other is None else (first, other)
+            trials = [self._grasp(first)] if other is None else self._both(asked)
             began_ns = min(step.t_ns for trial in trials for step in trial.steps[:1])
             self._seconds += (max(step.t_ns for trial in trials for step in trial.steps[-1:]) - began_ns) * 1e-9
             for ask, trial in zip(asked, trials, strict=True):

@@ -137,7 +137,7 @@ class _InVain:
 
 @dataclass
 class Order:
-    """Objects to be picked by one arm or two, in rounds: of those that fit, the easiest first.
+    """Objects to be picked one after the other, or two at once, in rounds: of those that fit, the easiest first.
 
     In a round everything in view is asked for once. What cannot be taken is left, and asked for in another round when
     an arm has moved anything since: it may have been in the way, or have hidden it, or lie otherwise itself. After a
@@ -150,7 +150,6 @@ class Order:
         labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
         bins: Where they go; None: to free spots.
         each: Most objects of one label, or of each label; 0: all.
-        arms: Arms of the robot: with two, two objects are asked for at once where there may be two.
         placed: Labels that were placed, in order.
         left: What could not be taken.
         failed: Labels that could not be asked for, or were never there, and why.
@@ -159,7 +158,6 @@ class Order:
     labels: Sequence[str]
     bins: Bins | None = None
     each: int | Mapping[str, int] = 0
-    arms: int = 1
     placed: list[str] = field(default_factory=list[str])
     left: list[Left] = field(default_factory=list[Left])
     failed: dict[str, str] = field(default_factory=dict[str, str])
@@ -189,27 +187,20 @@ class Order:
             known = ", ".join(self.bins.classes) or "no label"
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no bin for {', '.join(homeless)}; there are bins for {known}")
 
-    def next(self) -> tuple[GraspRequest, ...]:
-        """The next request, or two for both arms at once; none when the order has ended."""
+    def next(self) -> GraspRequest | None:
+        """The next request; None when the order has ended."""
         if self.over:
-            return ()
+            return None
         if self._held:
             held = self._held[0]
-            return (GraspRequest(f"{EASIEST} {held}", phase="place", place_choices=self._spots(held)),)
-        wanted = [label for label in dict.fromkeys(self.labels) if label not in self.failed and not self._enough(label)]
-        # whatever it was asked for as, what was placed or left is not asked for again
-        stay = (*self._stand, *(one.where for one in self.left if one.where is not None))
-        open_ = [label for label in wanted if label not in self._asked]
-        if open_:
-            more = [label for label in open_ for _ in range(min(self._missing(label), self.arms))][: self.arms]
-            asked = [GraspRequest(f"{EASIEST} {label}", exclude_near=stay) for label in more]
-            spots = [self._spots(label) for label in more]
-            if len(more) > 1 and spots[0] == spots[1]:  # not both on one
-                spots = [spots[0][k :: len(more)] for k in range(len(more))]
-            return tuple(replace(one, place_choices=choices) for one, choices in zip(asked, spots, strict=True))
+            return GraspRequest(f"{EASIEST} {held}", phase="place", place_choices=self._spots(held))
+        wanted = self._wanted()
+        for label in wanted:
+            if label not in self._asked:
+                return self._easiest(label)
         left = [one for one in self.left if one.label in wanted]
         if self._given_up or not left:
-            return ()
+            return None
         if any(one.after < self._moved for one in left):
             self._before, self.left, self._asked, self._by_place = self.left, [], set(), []
             return self.next()
@@ -217,11 +208,33 @@ class Order:
         for one in left:
             if one.where is not None and one.code in _BY_PLACE and not self._was_asked_for(one.where):
                 spots = self._spots(one.label)
-                return (GraspRequest(one.label, object_at=one.where, exclude_near=stay, place_choices=spots),)
+                return GraspRequest(one.label, object_at=one.where, exclude_near=stay, place_choices=spots)
         for code, one in product(_IN_THE_WAY, left):
             if one.code is code and one.where is not None and self._may_push(one.label, one.where):
-                return (GraspRequest(one.label, object_at=one.where, exclude_near=stay, phase="aside"),)
-        return ()
+                return GraspRequest(one.label, object_at=one.where, exclude_near=stay, phase="aside")
+        return None
+
+    def next_to(self, first: GraspRequest) -> GraspRequest | None:
+        """A request that another arm may carry out at the same time as the next one; None, when there is none."""
+        if first.phase != "all" or first.object_at is not None:
+            return None
+        taken = self.label_of(first)
+        for label in self._wanted(taken):
+            if label not in self._asked:
+                other = self._easiest(label)
+                # of one bin, from its other end
+                return replace(other, place_choices=other.place_choices[::-1])
+        return None
+
+    def _wanted(self, *taken: str) -> list[str]:
+        """Labels of which more is wanted when those that are taken have been placed."""
+        labels = dict.fromkeys(self.labels)
+        return [label for label in labels if label not in self.failed and not self._enough(label, *taken)]
+
+    def _easiest(self, label: str) -> GraspRequest:
+        """A request for any object of a label; whatever it was asked for as, what was placed or left is not meant."""
+        stay = (*self._stand, *(one.where for one in self.left if one.where is not None))
+        return GraspRequest(f"{EASIEST} {label}", exclude_near=stay, place_choices=self._spots(label))
 
     @property
     def _given_up(self) -> bool:
@@ -244,13 +257,9 @@ class Order:
         known = any(spot is not None and math.dist(where, spot[:2]) < SAME_SPOT for spot in pushed)
         return takes_all(label) and len(pushed) < _PUSHES and not known
 
-    def _missing(self, label: str) -> int:
-        """How many objects of a label are wanted yet, at most."""
+    def _enough(self, label: str, *taken: str) -> bool:
         most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
-        return max(most - self.placed.count(label), 0) if most else self.arms
-
-    def _enough(self, label: str) -> bool:
-        return self._missing(label) == 0
+        return 0 < most <= [*self.placed, *taken].count(label)
 
     def _at(self, spot: Spot, label: str = "") -> Iterator[Left]:
         """What was left about there, of a label, or of any."""

@@ -32,6 +32,7 @@ KNOWN = {
     "handover": "45ff17aef914318b",
     "pairs": "88db651be7bc2133",
     "pairs_in_turn": "b7c091603ddf3f98",
+    "orders": "937abd063cfacb6b",
 }
 
 

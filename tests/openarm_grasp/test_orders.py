@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -395,3 +397,32 @@ def test_what_is_seen_for_a_moment_does_not_keep_for_good_from_what_it_is_a_part
         ((0.30, 0.08), Code.IN_COLLISION),
         ((0.40, 0.18), Code.UNKNOWN_OBJECT),
     ]
+
+
+def test_another_arm_takes_another_object_at_the_same_time() -> None:
+    bins = Bins(bins={"all": Bin(x=(0.2, 0.3), y=(-0.3, 0.3))}, rest="all")
+    order = Order(("anything",), bins)
+    first = order.next()
+    assert first is not None
+    other = order.next_to(first)
+    assert other == replace(first, place_choices=first.place_choices[::-1])
+    order.done(first, Code.PLACE_FAILED, "the hand keeps it", seen=(0.3, 0.0), touched=True, held=True)
+    order.done(first, Code.PLACE_FAILED, "so does the other", seen=(0.3, 0.2), touched=True, held=True)
+    for _ in range(2):  # both hands put down what they hold, one after the other
+        placing = order.next()
+        assert placing is not None
+        assert placing.phase == "place"
+        assert order.next_to(placing) is None
+        order.done(placing, Code.OK, "", placed=(0.2, 0.1))
+    assert order.next() is not None
+
+
+def test_no_more_objects_are_taken_at_once_than_are_wanted() -> None:
+    order = Order(("red", "blue"), each=1)
+    first = order.next()
+    assert first == GraspRequest("easiest red")
+    assert order.next_to(first) == GraspRequest("easiest blue")
+    order.done(first, Code.OK, "", placed=(0.2, 0.1))
+    last = order.next()
+    assert last is not None
+    assert order.next_to(last) is None
