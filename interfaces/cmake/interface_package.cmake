@@ -22,12 +22,22 @@ function(drop_missing_include_folders)
   endforeach()
 endfunction()
 
+set(INTERFACE_PACKAGE_FOLDER "${CMAKE_CURRENT_LIST_DIR}")
+if(SKBUILD)
+  # Ten packages look for the same Python, and each search starts six interpreters.
+  macro(find_package name)
+    if(NOT ("${name}" STREQUAL Python3 AND Python3_NumPy_FOUND))
+      _find_package(${ARGV})
+    endif()
+  endmacro()
+endif()
+
 macro(interface_package)
   cmake_parse_arguments(PACKAGE "UPSTREAM" "" "DEPENDENCIES" ${ARGN})
 
   if(SKBUILD)
     # The ROS packages are wheels in the environment of the Python that builds.
-    find_package(Python3 REQUIRED COMPONENTS Interpreter)
+    find_package(Python3 REQUIRED COMPONENTS Interpreter Development.Module NumPy)
     execute_process(
       COMMAND "${Python3_EXECUTABLE}" -c "import sys; print(sys.prefix)"
       OUTPUT_VARIABLE PACKAGE_PREFIX OUTPUT_STRIP_TRAILING_WHITESPACE COMMAND_ERROR_IS_FATAL ANY)
@@ -52,8 +62,17 @@ macro(interface_package)
     # Python over rmw_fastrtps needs the C side only: leave out what only C++ nodes use (half of the build time). The
     # introspection type support stays: the middleware describes types by it.
     list(FILTER AMENT_EXTENSIONS_rosidl_generate_idl_interfaces EXCLUDE REGEX "_cpp:")
-    set(CMAKE_C_FLAGS_RELEASE -O1)
-    set(CMAKE_CXX_FLAGS_RELEASE -O1)
+    foreach(generator generator_type_description generator_c generator_py typesupport_c typesupport_fastrtps_c
+            typesupport_introspection_c)
+      list(PREPEND rosidl_${generator}_BIN "${INTERFACE_PACKAGE_FOLDER}/run_generator.py")
+    endforeach()
+    # Python imports this one alone, which finds the other type supports.
+    macro(rosidl_generator_py_get_typesupports supports)
+      set(${supports} rosidl_typesupport_c)
+    endmacro()
+    # Messages pass as fast as with -O1 (Fast CDR and CPython take the time), which takes twice as long to compile.
+    set(CMAKE_C_FLAGS_RELEASE -O0)
+    set(CMAKE_CXX_FLAGS_RELEASE -O0)
   endif()
 
   file(GLOB PACKAGE_FILES RELATIVE "${CMAKE_CURRENT_SOURCE_DIR}" CONFIGURE_DEPENDS msg/*.msg srv/*.srv action/*.action)
