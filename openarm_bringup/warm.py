@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`python -m openarm_bringup.warm [nodes]`: compile the numba kernels once, so that no node waits for them.
 
-`nodes`: those that nodes run in their executor, which must not halt for seconds. Those of calibration run in a worker
-thread: left out, they are compiled when they are first used, which the log of the node says.
+`nodes`: those that nodes run in their executor, which must not halt for seconds. The others are compiled when they are
+first used, which the log of the node says: those of calibration, which run in a worker thread, of depth images in
+metres, and of maps with many different log-odds, which the suite does not make itself.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def warm_hardware() -> None:
 OF_NODES = (
     octomap.warm, motion.warm_collision, grasp.warm, motion.warm_kinematics, perception.warm, warm_hardware, world.warm,
 )  # fmt: skip
-REST = (calibration.warm,)
+REST = (calibration.warm, octomap.warm_rest)
 
 
 def main() -> None:

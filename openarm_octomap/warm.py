@@ -14,35 +14,39 @@ from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
 from openarm_common.octree.codec import decode, encode_states
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.self_filter import SelfFilter, SelfFilterConfig, Shapes
+from openarm_common.types import Floats
 from openarm_octomap.config import GridConfig
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
 
-#: Images of one place in millimetres and in metres, and from where.
-_MILLIMETRES, _METRES = np.full((6, 8), 200, np.uint16), np.full((6, 8), 0.2, np.float32)
 _T_BASE_CAMERA = se3.make(None, (0.15, 0.15, 0.0))
 
 
 def warm() -> None:
-    """Run each kernel once with the types that the package uses; the compiled code is cached next to the sources."""
+    """Run each kernel once: images in millimetres, and cells of one byte, as every map has at first."""
+    _run(np.full((6, 8), 200, np.uint16), np.full(300, 1.0, np.float32))
+
+
+def warm_rest() -> None:
+    """Run the kernels again for images in metres, and for cells of two bytes, as a map that was loaded may have."""
+    _run(np.full((6, 8), 0.2, np.float32), np.linspace(-1.0, 1.0, 300, dtype=np.float32))
+
+
+def _run(depth: NDArray[Any], log_odds: Floats) -> None:
+    """Fill a map with leaves of some log-odds (300,), put an image into it, and use it in every way."""
     grid, robot = _grid(), _robot()
     index = np.argwhere(np.ones((8, 8, 8), bool))[:300] + grid.lattice.key_min
-    leaves = np.column_stack([np.zeros(len(index)), index]).astype(np.int32)
-    # cells of one byte, then of two
-    for log_odds in (np.full(300, 1.0, np.float32), np.linspace(-1.0, 1.0, 300, dtype=np.float32)):
-        grid.reset()
-        grid.blocks.paint(leaves, log_odds)
-        for depth in (_MILLIMETRES, _METRES):
-            points = _map(grid, robot, depth).points()
-        robot[0].label_points(points, robot[1])
-        grid.integrate([CloudScan(points, _T_BASE_CAMERA[:3, 3])], 0)
-        grid.decay(0)
-        encode_states(*grid.coarse(15))
-        for payload in (grid.binary(), grid.full()):
-            tree = decode(payload.data, grid.lattice.resolution, binary=payload.binary)
-            tree.on(grid.lattice)
-            _grid().load(tree, _T_BASE_CAMERA)
-        grid.clear_box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+    grid.blocks.paint(np.column_stack([np.zeros(len(index)), index]).astype(np.int32), log_odds)
+    points = _map(grid, robot, depth).points()
+    robot[0].label_points(points, robot[1])
+    grid.integrate([CloudScan(points, _T_BASE_CAMERA[:3, 3])], 0)
+    grid.decay(0)
+    encode_states(*grid.coarse(15))
+    for payload in (grid.binary(), grid.full()):
+        tree = decode(payload.data, grid.lattice.resolution, binary=payload.binary)
+        tree.on(grid.lattice)
+        _grid().load(tree, _T_BASE_CAMERA)
+    grid.clear_box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
 
 
 def _grid() -> OccupancyGrid:

@@ -22,9 +22,10 @@ def _python(*arguments: str) -> None:
 def _idl(folder: Path, *interfaces: str) -> list[str]:
     """Write interfaces as .idl; return where they are, as generators take them."""
     asked = folder / "adapter.json"
-    asked.write_text(json.dumps({"non_idl_tuples": [f"{_INTERFACES}/openarm_interfaces:{name}" for name in interfaces]}))
-    package, output = ("--package-name", "openarm_interfaces"), ("--output-dir", str(folder / "idl"))
-    _python("-m", "rosidl_adapter", *package, "--arguments-file", str(asked), *output, "--output-file", f"{folder}/made")
+    wanted = [f"{_INTERFACES}/openarm_interfaces:{name}" for name in interfaces]
+    asked.write_text(json.dumps({"non_idl_tuples": wanted}))
+    into = ("--output-dir", f"{folder}/idl", "--output-file", f"{folder}/made")
+    _python("-m", "rosidl_adapter", "--package-name", "openarm_interfaces", "--arguments-file", str(asked), *into)
     return (folder / "made").read_text().splitlines()
 
 
