@@ -9,13 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import DepthImage, DepthView
 from openarm_common.kernels import kernel
-from openarm_common.types import Array
+from openarm_common.types import Array, Floats
 from openarm_world.config import WorldConfig
 
 #: States of points.
 SEEN, FREE, HIDDEN = np.int8(1), np.int8(-1), np.int8(0)
+#: Pixel of the image that a cloud makes, rad: clouds leave out every second row and column of a camera.
+_PIXEL = 0.004
+#: Half the width of that image, pixels: 50 degrees.
+_HALF = 300
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,31 @@ def explain(points: Array, T_motion: Array, view: DepthView, config: WorldConfig
     return Shares(seen, free, 1.0 - seen - free)
 
 
-def look(points: Array, T_motion: Array, view: DepthView, config: WorldConfig) -> NDArray[np.int8]:
+def view_of(points: Floats, camera: Array) -> DepthView:
+    """Return the depth image that points make from where they were seen; where there is none it has no depth.
+
+    Args:
+        points: (n, 3) base frame, m.
+        camera: (3,) origin of the optical frame that they were seen in, base frame, m.
+    """
+    ahead = points.mean(axis=0, dtype=np.float64) - camera if len(points) else np.array([0.0, 0.0, -1.0])
+    T_base_camera = se3.make(se3.rotation_from_z_y(ahead, np.eye(3)[np.abs(ahead).argmin()]), camera)
+    local = se3.apply(se3.inverse(T_base_camera), points.astype(np.float64))
+    local = local[np.abs(local[:, :2]).max(axis=1) < _HALF * _PIXEL * local[:, 2]]
+    u, v = (np.floor(local[:, :2] / local[:, 2:] / _PIXEL + 0.5).astype(np.int64) + _HALF).T
+    size, f = 2 * _HALF + 1, 1.0 / _PIXEL
+    depth = np.full((size, size), np.inf, np.float32)
+    np.minimum.at(depth, (v, u), local[:, 2].astype(np.float32))
+    depth[np.isinf(depth)] = np.nan
+    return DepthView(depth, Intrinsics(size, size, f, f, _HALF, _HALF), T_base_camera, 0.0, np.inf)
+
+
+def look(
+    points: Array,
+    T_motion: Array,
+    view: DepthView,
+    config: WorldConfig = WorldConfig(),  # noqa: B008 - frozen
+) -> NDArray[np.int8]:
     """Return the state (n,) of each point, SEEN, FREE or HIDDEN; arguments as `explain`."""
     T, lens = se3.inverse(view.T_base_camera) @ T_motion, view.intrinsics
     pinhole = np.array([lens.fx, lens.fy, lens.cx, lens.cy])

@@ -20,6 +20,8 @@ from openarm_common.objects.resting import least_box_middles
 from openarm_common.types import Array
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict
+from openarm_grasp.perception.detections import Frame
+from openarm_world.shares import explain, view_of
 
 #: A thing that rests as it rested is as high as before, m, or to this share of its height.
 _HEIGHT, _HEIGHT_SHARE = 0.008, 0.08
@@ -27,8 +29,6 @@ _HEIGHT, _HEIGHT_SHARE = 0.008, 0.08
 _EXTENT, _EXTENT_SHARE = 0.015, 0.15
 #: A cluster with a smaller share of the points of the thing is a remainder of something else.
 _SAME_THING = 0.3
-#: What is lower than the thing was, by so much, m, or by this share of its height, is something else.
-_LOWER, _LOWER_SHARE = 0.015, 0.25
 #: Of the points of a thing that has not moved so many lie where it was, %: the rest may be the edge of the hand.
 _MOST = 85.0
 #: Fewer points of what hangs in a hand may be of its edge, or of something else.
@@ -77,13 +77,6 @@ class Cluster:
         extent = float(np.ptp(np.percentile(along, (1.0, 99.0), axis=0), axis=0).max())
         return cls(flat.mean(axis=0), top, extent, len(flat), cut, _upper(flat))
 
-    def stands_where(self, before: Cluster) -> bool:
-        """Whether most of what was seen of a thing before is where this is now; taken for so, where it is not known."""
-        if self.upper is None or before.upper is None:
-            return True
-        away, _ = KDTree(self.upper).query(before.upper)
-        return float(np.median(away)) <= 2.0 * _CELL
-
     def away_from(self, p: Array) -> float:
         """How far its middle is from (2,) or (3,) a point, seen from above, m.
 
@@ -94,55 +87,34 @@ class Cluster:
         return float(np.linalg.norm(middles - p[:2], axis=1).min())
 
 
-@dataclass(frozen=True, eq=False)
-class ClusterFrame:
-    """All clusters of one image.
-
-    Attributes:
-        t_ns: Stamp of the image.
-        clusters: What is on the table, and what hangs over it; the robot left out.
-        place_in_view: Whether the place that is asked about is in the image, and the robot does not hide it.
-    """
-
-    t_ns: int
-    clusters: tuple[Cluster, ...]
-    place_in_view: bool = True
-
-
-def judge_gone(
-    before: Cluster, frames: Sequence[ClusterFrame], config: HeldConfig, *, match_radius: float
-) -> CameraVerdict:
-    """Whether a thing has left its place: GRASP_MISSED, when it is still there; STALE_DATA, when nothing shows it.
+def judge_gone(before: Array, frames: Sequence[Frame], config: HeldConfig) -> CameraVerdict:
+    """Whether an object has left its place: GRASP_MISSED, when it is still there; STALE_DATA, when nothing shows it.
 
     Args:
-        before: The thing as it was before the grasp.
-        frames: Taken after the lift; each whose view of the place is free counts.
+        before: (n, 3) points of it as it was before the grasp.
+        frames: Taken after the lift; each that shows its place counts.
         config: Thresholds.
-        match_radius: Horizontal distance that counts as the old place, m.
     """
-    showing = [frame for frame in frames if frame.place_in_view]
-    if not showing:
+    left = _left(before, frames, config)
+    if not left:
         what = "no camera frame after the lift" if not frames else "the robot or the border hides where the object was"
         return CameraVerdict(Code.STALE_DATA, f"{what}: nothing shows whether it has gone")
-    highest = 0.0
-    for frame in showing:
-        for cluster in frame.clusters:
-            away = _apart(cluster, before.centroid)
-            risen = cluster.top - before.top
-            if away > match_radius + 0.5 * cluster.extent or cluster.points < _SAME_THING * before.points:
-                continue
-            if risen >= config.rise:
-                highest = max(highest, risen)
-            # what it lay on, or leant against, shows when it has gone, and is lower
-            elif (
-                away <= match_radius
-                and -risen <= max(_LOWER, _LOWER_SHARE * (before.top - _floor(before)))
-                and cluster.stands_where(before)
-            ):
-                text = f"something of its height still stands at its place ({away * 1e3:.0f} mm from it)"
-                return CameraVerdict(Code.GRASP_MISSED, text)
-    text = f", and is seen {highest * 1e3:.0f} mm higher" if highest else ""
-    return CameraVerdict(Code.OK, f"the cluster has gone from its place{text}")
+    if min(left) < config.gone:
+        text = f"{1.0 - min(left):.0%} of it are still seen at its place, expected less than {1.0 - config.gone:.0%}"
+        return CameraVerdict(Code.GRASP_MISSED, text)
+    return CameraVerdict(Code.OK, "it has gone from its place")
+
+
+def stays(before: Array, frames: Sequence[Frame], config: HeldConfig) -> bool:
+    """Whether something with such points (n, 3) is still where it was; taken for so, where no frame shows its place."""
+    return not any(left >= config.gone for left in _left(before, frames, config))
+
+
+def _left(before: Array, frames: Sequence[Frame], config: HeldConfig) -> list[float]:
+    """Share of the points (n, 3) in view that is seen through, of each frame that shows enough of them."""
+    clouds = (frame.cloud for frame in frames if frame.cloud is not None)
+    shares = (explain(before, np.eye(4), view_of(cloud.points, cloud.camera)) for cloud in clouds)
+    return [one.left for one in shares if one.in_view >= config.in_view]
 
 
 def judge_held(standing: Array, points: Array, T_now_before: Array, config: HeldConfig) -> CameraVerdict:
@@ -253,34 +225,28 @@ def _upper(points: Array) -> Array:
 
 
 def judge_rests(
-    before: Cluster, p_expected: Array, frames: Sequence[ClusterFrame], tolerance: float, *, leaned: bool = False
+    before: Cluster, p_expected: Array, clusters: Sequence[Cluster], tolerance: float, *, leaned: bool = False
 ) -> CameraVerdict:
     """Whether a thing rests at its target as it rested before the grasp.
 
     Args:
         before: The thing as it was; one that was cut off proves nothing.
         p_expected: (2,) or (3,) where its middle should be, base frame, m; z is not read.
-        frames: Taken after the arm has left; the newest that shows it counts.
+        clusters: What an image shows that was taken after the arm has left.
         tolerance: Largest horizontal distance, m.
         leaned: It may have lain on something else: it may be lower now, and look longer.
     """
-    if not frames:
-        return CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
     if before.cut:
         return CameraVerdict(
             Code.PLACE_FAILED, "the object was cut off when it was first seen: its middle is not known"
         )
     reach = tolerance + 0.5 * before.extent
-    cut = False
-    for frame in reversed(frames):
-        near = [c for c in frame.clusters if c.points >= _SAME_THING * before.points]
-        near = [c for c in near if c.away_from(p_expected) <= reach]
-        whole = [c for c in near if not c.cut]
-        cut = cut or len(whole) < len(near)
-        if whole and frame.place_in_view:
-            nearest = min(whole, key=lambda c: c.away_from(p_expected))
-            return _compare(before, nearest, p_expected, tolerance, leaned=leaned)
-    why = "is cut off by the border, the robot or another thing" if cut else "is not in view"
+    near = [c for c in clusters if c.points >= _SAME_THING * before.points and c.away_from(p_expected) <= reach]
+    whole = [c for c in near if not c.cut]
+    if whole:
+        nearest = min(whole, key=lambda c: c.away_from(p_expected))
+        return _compare(before, nearest, p_expected, tolerance, leaned=leaned)
+    why = "is cut off by the border, the robot or another thing" if near else "is not in view"
     return CameraVerdict(Code.PLACE_FAILED, f"the object {why} after the place: nothing shows that it stands there")
 
 
@@ -304,7 +270,3 @@ def _compare(before: Cluster, now: Cluster, p_expected: Array, tolerance: float,
 def _floor(c: Cluster) -> float:
     """About the height of what it stands on: its points are above that, half of them below their middle, m."""
     return 2.0 * float(c.centroid[2]) - c.top
-
-
-def _apart(c: Cluster, p: Array) -> float:
-    return float(np.linalg.norm(c.centroid[:2] - p[:2]))

@@ -13,16 +13,16 @@ from scipy.spatial import KDTree
 
 from openarm_common import se3
 from openarm_common.detection import Detection, gap
-from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array, Floats
-from openarm_grasp.evidence.shapes import Cluster, ClusterFrame
+from openarm_grasp.evidence.shapes import Cluster
 from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart
 from openarm_grasp.perception.sightings import divided, in_box, joined, object_points, points_around
+from openarm_world.shares import HIDDEN, SEEN, look, view_of
 
 #: A place is in view where a point lies this near to it, seen from above, m.
 _IN_VIEW = 0.025
-#: What is seen this near to what stood there is that, and what is seen this near to its middle may be, m.
-_STOOD, _STANDS = 0.015, 0.025
+#: What is seen this near to what stood there is that, m.
+_STOOD = 0.015
 #: Nothing that hangs in the hand reaches farther from where it stood, m.
 _REACH = 0.35
 #: What has risen with a thing is seen this near to where it is then, m; a part is seen so by more than this share.
@@ -31,8 +31,6 @@ _PART, _MOST = 0.008, 0.5
 _NEXT_CELL = 1.8
 #: What stayed of a thing is another one where it was this share of it: of less, its neighbours may be seen there.
 _LEFT = 0.15
-#: A point is free where a ray as near to its own, rad, ends so far behind it, m.
-_RAY, _BEHIND = 0.010, 0.015
 #: Fewer points are no cluster.
 _LEAST_POINTS = 30
 
@@ -65,14 +63,16 @@ def nearest_to(frames: Sequence[Frame], p_base: Array) -> tuple[Detection | None
     return frame.detections[number], points
 
 
-def cluster_frames(frames: Sequence[Frame], place: Array) -> tuple[ClusterFrame, ...]:
-    """Return the clusters of frames; those without a cloud are left out.
-
-    Args:
-        frames: In the base frame.
-        place: (2,) or (3,) the place that is asked about.
-    """
-    return tuple(_clusters(frame, frame.cloud, place) for frame in frames if frame.cloud is not None)
+def clusters_of(frame: Frame) -> tuple[Cluster, ...]:
+    """Return what an image shows of each thing of which it has points enough; nothing without a cloud."""
+    cloud, found = frame.cloud, list[Cluster]()
+    if cloud is None:
+        return ()
+    for number, detection in enumerate(frame.detections, start=1):
+        points = cloud.points[cloud.labels == number].astype(np.float64)
+        if len(points) >= _LEAST_POINTS:
+            found.append(Cluster.of(points, cut=not detection.measured))
+    return tuple(found)
 
 
 def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Array:
@@ -121,15 +121,20 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
     cloud = next((frame.cloud for frame in reversed(frames) if frame.cloud is not None), None)
     if cloud is None or not len(cloud.points):
         return sighting
-    now = _Sight(cloud)
     standing = cloud.points[cloud.labels > 0]
-    standing = standing[now.away(standing, risen) > _PART]
+    standing = standing[_away(standing, risen) > _PART]
+    view = view_of(cloud.points, cloud.camera)
 
     def rose(points: Array) -> NDArray[np.int8]:
-        return now.says(se3.apply(T_now_before, points), risen)
+        return says(se3.apply(T_now_before, points), risen)
 
     def stays(points: Array) -> NDArray[np.int8]:
-        return now.says(points, standing)
+        return says(points, standing)
+
+    def says(points: Array, seen: Array | Floats) -> NDArray[np.int8]:
+        """Whether points (n, 3) are among those that are seen (1), seen through (-1), or neither (0)."""
+        free = np.minimum(look(points, np.eye(4), view), HIDDEN)
+        return np.where(_away(points, seen) < _PART, SEEN, free)
 
     around = points_around(sighting.clouds[-1:])
     parts = [one for one in sighting.others if _is_part(around[in_box(around, one)], rose, stays)]
@@ -145,6 +150,11 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
     # and what was pushed a little is free at its border, too
     left[~left] = ~_in_one_piece(own[~left], grip)
     return divided(whole, left)
+
+
+def _away(points: Array | Floats, others: Array | Floats) -> Array:
+    """How far (n,) points (n, 3) are from the nearest of others (m, 3), m."""
+    return np.full(len(points), np.inf) if not len(others) else np.asarray(KDTree(others).query(points)[0])
 
 
 def _in_one_piece(points: Array, start: Array) -> NDArray[np.bool_]:
@@ -169,46 +179,6 @@ def _is_part(
     return bool(there >= _LEAST_POINTS // 2 and there > _MOST * seen and stayed < _MOST * len(points))
 
 
-class _Sight:
-    """What one image says of points in space.
-
-    Args:
-        cloud: Of the image.
-    """
-
-    def __init__(self, cloud: LabelledCloud) -> None:
-        self._camera = cloud.camera
-        away = cloud.points.astype(np.float64) - cloud.camera
-        self._far = np.linalg.norm(away, axis=1)
-        self._rays = KDTree(away / self._far[:, None])
-
-    @staticmethod
-    def away(points: Array | Floats, others: Array | Floats) -> Array:
-        """How far (n,) points (n, 3) are from the nearest of others (m, 3), m."""
-        return np.full(len(points), np.inf) if not len(others) else np.asarray(KDTree(others).query(points)[0])
-
-    def says(self, points: Array, seen: Array | Floats) -> NDArray[np.int8]:
-        """Whether points (n, 3) are seen (1), seen to be free (-1), or hidden (0): (n,).
-
-        Args:
-            points: That are asked about.
-            seen: (m, 3) points of the image that count.
-        """
-        rays = points - self._camera
-        far = np.linalg.norm(rays, axis=1)
-        turn, nearest = self._rays.query(rays / far[:, None])
-        free = (turn < _RAY) & (self._far[nearest] > far + _BEHIND)
-        return np.where(self.away(points, seen) < _PART, 1, np.where(free, -1, 0)).astype(np.int8)
-
-
-def stands(other: Detection, frames: Sequence[Frame]) -> bool:
-    """Whether something still stands about where something stood; taken for so, where no cloud says it."""
-    clouds = [frame.cloud for frame in frames if frame.cloud is not None]
-    points = [cloud.points[cloud.labels > 0] for cloud in clouds]
-    near = (np.linalg.norm(each[:, :2] - other.p_base[:2], axis=1) < _STANDS for each in points)
-    return not clouds or any(bool(one.any()) for one in near)
-
-
 def came_next_to(now: Detection, before: Sequence[Detection], frames: Sequence[Frame], reach: float) -> bool:
     """Whether something is seen next to a thing that was not there before.
 
@@ -221,13 +191,3 @@ def came_next_to(now: Detection, before: Sequence[Detection], frames: Sequence[F
     frame = next(frame for frame in reversed(frames) if any(d is now for d in frame.detections))
     near = (d for d in frame.detections if d is not now and gap(d, now) < reach)
     return any(all(apart(d, other) > SAME_PLACE for other in before) for d in near)
-
-
-def _clusters(frame: Frame, cloud: LabelledCloud, place: Array) -> ClusterFrame:
-    found: list[Cluster] = []
-    for number, detection in enumerate(frame.detections, start=1):
-        points = cloud.points[cloud.labels == number].astype(np.float64)
-        if len(points) >= _LEAST_POINTS:
-            found.append(Cluster.of(points, cut=not detection.measured))
-    near = np.linalg.norm(cloud.points[:, :2] - np.asarray(place[:2], np.float32), axis=1) < _IN_VIEW
-    return ClusterFrame(frame.t_ns, tuple(found), bool(near.any()))

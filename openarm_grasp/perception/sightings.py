@@ -25,6 +25,11 @@ def object_points(clouds: Sequence[LabelledCloud]) -> Array:
     return np.concatenate([np.empty((0, 3)), *mine])
 
 
+def first_points(sighting: Sighting) -> Array:
+    """Return the points (n, 3) of the object in the oldest of its images: all are of its first camera."""
+    return object_points(sighting.clouds[:1])
+
+
 def points_around(clouds: Sequence[LabelledCloud]) -> Array:
     """Points (n, 3) of what stands around an object in clouds whose points labelled 1 are its."""
     return np.concatenate([np.empty((0, 3)), *(cloud.points[cloud.labels > 1].astype(np.float64) for cloud in clouds)])

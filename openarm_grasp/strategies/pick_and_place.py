@@ -22,9 +22,9 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.shapes import heavier_end, judge_gone, judge_held, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict, Verdict
-from openarm_grasp.perception.clouds import cluster_frames, cluster_of, lifted, nearest_to, risen_points
+from openarm_grasp.perception.clouds import lifted, nearest_to, risen_points
 from openarm_grasp.perception.detections import Frame, apart
-from openarm_grasp.perception.sightings import object_points, points_around
+from openarm_grasp.perception.sightings import first_points, object_points, points_around
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.planning.options import NO_WAY
@@ -309,8 +309,7 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
         thing = lifted(frames, sighting, points, moved, T_before[:3, 3])
         if thing is not sighting:
             grasp = run.grasp = regrasped(run, grasp, thing)
-        place, radius = thing.target.p_base, config.detect.match_radius
-        camera = judge_gone(cluster_of(thing), cluster_frames(frames, place), config.held, match_radius=radius)
+        camera = judge_gone(first_points(thing), frames, config.held)
         if camera.ok:
             before = np.concatenate([object_points(sighting.clouds), points_around(sighting.clouds)])
             where = judge_held(columns(before, run.context.table.top_z), points, moved, config.held)

@@ -15,11 +15,11 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.objects.resting import least_box_middles
 from openarm_common.types import Array
 from openarm_grasp.evidence import verdicts
-from openarm_grasp.evidence.shapes import Cluster, is_more, judge_moved, judge_rests
+from openarm_grasp.evidence.shapes import Cluster, is_more, judge_moved, judge_rests, stays
 from openarm_grasp.evidence.verdicts import CameraVerdict
-from openarm_grasp.perception.clouds import came_next_to, cluster_frames, cluster_of, nearest_to, stands
+from openarm_grasp.perception.clouds import came_next_to, cluster_of, clusters_of, nearest_to
 from openarm_grasp.perception.detections import NEXT_TO, Frame
-from openarm_grasp.perception.sightings import object_points
+from openarm_grasp.perception.sightings import in_box, object_points, points_around
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.place import placing_error
 from openarm_grasp.requests.states import State
@@ -89,7 +89,7 @@ def _judge_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]
     for age, frame in enumerate(reversed(frames)):
         verdict = judge(frame, run, grasp, target, before, T_base_now)
         if verdict.ok:
-            return _gone_with_it(grasp, frames) or verdict
+            return _gone_with_it(run, grasp, frames) or verdict
         newest = verdict if age == 0 else newest
     return newest
 
@@ -102,9 +102,11 @@ def _unproven(text: str, *, final: bool = False) -> CameraVerdict:
     return CameraVerdict(Code.PLACE_FAILED, text, final=final)
 
 
-def _gone_with_it(grasp: Grasp, frames: Sequence[Frame]) -> CameraVerdict | None:
+def _gone_with_it(run: Run, grasp: Grasp, frames: Sequence[Frame]) -> CameraVerdict | None:
     """Return why the middle of what is seen is not known after all; None where nothing has gone with it."""
-    torn = next((d for d in grasp.adjacent if not stands(d, frames)), None)
+    around = points_around(grasp.sighting.clouds[:1])
+    left = (d for d in grasp.adjacent if not stays(around[in_box(around, d)], frames, run.config.held))
+    torn = next(left, None)
     if torn is None and not grasp.merged:
         return None
     d, what = (torn, "is a part of it") if torn is not None else (grasp.merged[0], "may be another thing")
@@ -127,7 +129,7 @@ def _seen_whole(
     tolerance = _SEEN_WITHIN * config.place.tolerance
     # next to others it may have been several things, or have lain on one: such come apart, or fall
     leaned = _was_next_to_others(grasp)
-    rested = judge_rests(before, place, cluster_frames((frame,), place), tolerance, leaned=leaned)
+    rested = judge_rests(before, place, clusters_of(frame), tolerance, leaned=leaned)
     if not rested.ok:
         return rested
     # next to what was left behind the middle of both may be where that of one thing and the other should be

@@ -15,13 +15,13 @@ from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.shapes import (
     Cluster,
-    ClusterFrame,
     is_more,
     judge_gone,
     judge_held,
     judge_moved,
     judge_rests,
     judge_unmoved,
+    stays,
 )
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
 from openarm_grasp.perception.clouds import came_next_to, lifted, risen_points
@@ -66,55 +66,27 @@ def test_the_gap_after_closing_is_the_reference_for_slip():
     assert grip(0.0155, was_held=True, closed=0.0172).ok  # no longer the interval
 
 
-def frame(*clusters, in_view=True):
-    return ClusterFrame(0, clusters, in_view)
-
-
 def at(x, y, **changes):
     return replace(STOOD, centroid=np.array([x, y, STOOD.centroid[2]]), **changes)
 
 
 @pytest.mark.parametrize(
-    ("frames", "code", "words"),
+    ("clusters", "code", "words"),
     [
-        ([frame()], Code.OK, "has gone from its place"),
-        ([frame(at(0.27, -0.2))], Code.GRASP_MISSED, "still stands"),
-        ([frame(), frame(at(0.28, -0.2))], Code.GRASP_MISSED, "still stands"),
-        ([frame(at(0.27, -0.2, top=0.55))], Code.OK, "110 mm higher"),
-        ([frame(at(0.27, -0.2, points=100))], Code.OK, "has gone"),
-        ([frame(at(0.27, -0.2, top=0.42))], Code.OK, "has gone"),  # what it lay on
-        ([frame(at(0.27, -0.2, top=0.43))], Code.GRASP_MISSED, "still stands"),
-        ([frame(at(0.40, -0.3))], Code.OK, "has gone"),
-        ([frame(in_view=False)], Code.STALE_DATA, "hides where the object was"),
-        ([frame(in_view=False), frame()], Code.OK, "has gone"),
-        ([], Code.STALE_DATA, "no camera frame"),
+        ([at(0.31, 0.101)], Code.OK, "mm from its target"),
+        ([at(0.33, 0.1)], Code.PLACE_FAILED, "30 mm from its target"),
+        ([at(0.30, 0.1, top=0.455)], Code.PLACE_FAILED, "15 mm higher"),
+        ([at(0.30, 0.1, top=0.43)], Code.PLACE_FAILED, "10 mm lower"),
+        ([at(0.30, 0.1, extent=0.16)], Code.PLACE_FAILED, "40 mm longer"),
+        ([at(0.30, 0.1, extent=0.08)], Code.PLACE_FAILED, "40 mm shorter"),
+        ([at(0.30, 0.1, extent=0.099)], Code.PLACE_FAILED, "21 mm shorter"),
+        ([at(0.30, 0.1, cut=True)], Code.PLACE_FAILED, "cut off"),
+        ([at(0.30, 0.1, points=100)], Code.PLACE_FAILED, "not in view"),
+        ([], Code.PLACE_FAILED, "not in view"),
     ],
 )
-def test_a_cluster_has_gone_only_when_a_free_view_shows_its_place_empty(frames, code, words):
-    verdict = judge_gone(STOOD, frames, HELD, match_radius=0.03)
-    assert verdict.code is code
-    assert words in verdict.reason
-
-
-@pytest.mark.parametrize(
-    ("frames", "code", "words"),
-    [
-        ([frame(at(0.31, 0.101))], Code.OK, "mm from its target"),
-        ([frame(at(0.33, 0.1))], Code.PLACE_FAILED, "30 mm from its target"),
-        ([frame(at(0.30, 0.1, top=0.455))], Code.PLACE_FAILED, "15 mm higher"),
-        ([frame(at(0.30, 0.1, top=0.43))], Code.PLACE_FAILED, "10 mm lower"),
-        ([frame(at(0.30, 0.1, extent=0.16))], Code.PLACE_FAILED, "40 mm longer"),
-        ([frame(at(0.30, 0.1, extent=0.08))], Code.PLACE_FAILED, "40 mm shorter"),
-        ([frame(at(0.30, 0.1, extent=0.099))], Code.PLACE_FAILED, "21 mm shorter"),
-        ([frame(at(0.30, 0.1, cut=True))], Code.PLACE_FAILED, "cut off"),
-        ([frame(at(0.30, 0.1, points=100))], Code.PLACE_FAILED, "not in view"),
-        ([frame()], Code.PLACE_FAILED, "not in view"),
-        ([frame(at(0.30, 0.1)), frame(at(0.30, 0.1, cut=True))], Code.OK, "mm from its target"),
-        ([], Code.STALE_DATA, "no camera frame"),
-    ],
-)
-def test_a_thing_rests_where_its_middle_is_as_high_and_as_long_as_before(frames, code, words):
-    verdict = judge_rests(STOOD, np.array([0.30, 0.1]), frames, 0.02)
+def test_a_thing_rests_where_its_middle_is_as_high_and_as_long_as_before(clusters, code, words):
+    verdict = judge_rests(STOOD, np.array([0.30, 0.1]), clusters, 0.02)
     assert verdict.code is code
     assert words in verdict.reason
 
@@ -126,12 +98,12 @@ def test_the_middle_is_that_of_the_outline_however_many_points_are_on_one_end():
     cluster = Cluster.of(one_end)
     assert cluster.centroid[0] < 0.08
     assert cluster.away_from(np.array([0.1, 0.02])) < 0.001
-    verdict = judge_rests(Cluster.of(plate), np.array([0.1, 0.02]), [frame(cluster)], 0.015)
+    verdict = judge_rests(Cluster.of(plate), np.array([0.1, 0.02]), [cluster], 0.015)
     assert verdict.ok, verdict.reason
 
 
 def test_what_was_cut_off_when_it_was_first_seen_is_never_said_to_be_placed():
-    verdict = judge_rests(replace(STOOD, cut=True), np.array([0.30, 0.1]), [frame(at(0.30, 0.1))], 0.02)
+    verdict = judge_rests(replace(STOOD, cut=True), np.array([0.30, 0.1]), [at(0.30, 0.1)], 0.02)
     assert verdict.code is Code.PLACE_FAILED
 
 
@@ -139,10 +111,10 @@ def test_what_was_cut_off_when_it_was_first_seen_is_never_said_to_be_placed():
 def test_what_lay_on_something_else_may_rest_lower_and_longer():
     p = np.array([0.30, 0.1])
     lower, higher, short = at(0.30, 0.1, top=0.428, extent=0.16), at(0.30, 0.1, top=0.455), at(0.30, 0.1, extent=0.08)
-    assert not judge_rests(STOOD, p, [frame(lower)], 0.02).ok
-    assert judge_rests(STOOD, p, [frame(lower)], 0.02, leaned=True).ok
-    assert not judge_rests(STOOD, p, [frame(higher)], 0.02, leaned=True).ok
-    assert not judge_rests(STOOD, p, [frame(short)], 0.02, leaned=True).ok
+    assert not judge_rests(STOOD, p, [lower], 0.02).ok
+    assert judge_rests(STOOD, p, [lower], 0.02, leaned=True).ok
+    assert not judge_rests(STOOD, p, [higher], 0.02, leaned=True).ok
+    assert not judge_rests(STOOD, p, [short], 0.02, leaned=True).ok
 
 
 def test_a_cluster_is_measured_without_its_few_flying_points():
@@ -201,14 +173,6 @@ def test_what_hangs_in_the_hand_may_have_been_hidden_below_what_was_seen():
 def slab(x, y, half=(0.05, 0.02), top=0.44, n=1500):
     rng = np.random.default_rng(int(1e3 * (x + 2 * y)) % 97)
     return np.column_stack([x + half[0] * rng.uniform(-1, 1, n), y + half[1] * rng.uniform(-1, 1, n), np.full(n, top)])
-
-
-def test_a_neighbour_of_its_height_next_to_its_place_is_not_the_thing_that_has_gone():
-    before = Cluster.of(slab(0.27, -0.20))
-    neighbour = Cluster.of(slab(0.28, -0.172, half=(0.06, 0.005), n=3000))
-    assert judge_gone(before, [frame(neighbour)], HELD, match_radius=0.03).ok
-    still = Cluster.of(slab(0.271, -0.201))
-    assert judge_gone(before, [frame(still)], HELD, match_radius=0.03).code is Code.GRASP_MISSED
 
 
 @pytest.mark.parametrize(("off", "code"), [(0.0, Code.OK), (0.004, Code.OK), (0.03, Code.PLACE_FAILED)])
@@ -361,7 +325,29 @@ def test_a_thing_with_its_part_is_one():
     assert whole.target.measured
 
 
+STANDING = seen(HANDLE, NEIGHBOUR)
+
+
 def test_a_part_that_was_seen_apart_before_has_not_moved():
     now = np.concatenate([HANDLE, HEAD])
     assert judge_unmoved(HANDLE, now, HELD, HEAD) == (True, "the object still stands there")
     assert not judge_unmoved(HANDLE, now, HELD, NEIGHBOUR)[0]
+
+
+@pytest.mark.parametrize(
+    ("frames", "code", "words"),
+    [
+        (STANDING, Code.GRASP_MISSED, "still seen at its place"),
+        (seen(NEIGHBOUR), Code.OK, "gone from its place"),
+        (seen(NEIGHBOUR) + STANDING, Code.GRASP_MISSED, "still seen"),
+        (seen(OVER + 0.6 * (HANDLE - OVER), NEIGHBOUR), Code.STALE_DATA, "hides where the object was"),
+        (seen(OVER + 0.6 * (HANDLE - OVER), NEIGHBOUR) + seen(NEIGHBOUR), Code.OK, "gone from its place"),
+        (seen(slab(0.27, -0.20, top=0.42)), Code.OK, "gone from its place"),  # what it lay on
+        (seen(slab(0.28, -0.172, half=(0.06, 0.005), n=3000)), Code.OK, "gone from its place"),  # a neighbour
+        ([], Code.STALE_DATA, "no camera frame"),
+    ],
+)
+def test_an_object_has_gone_when_a_free_view_shows_its_place_empty(frames, code, words):
+    verdict = judge_gone(HANDLE, frames, HELD)
+    assert (verdict.code, words in verdict.reason) == (code, True), verdict.reason
+    assert stays(HANDLE, frames, HELD) is (not any(judge_gone(HANDLE, [one], HELD).ok for one in frames))

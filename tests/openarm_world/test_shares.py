@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.camera.depth_view import DepthView
-from openarm_world import Shares, explain
+from openarm_world import Shares, explain, view_of
 from tests.openarm_world.made import ABOVE, LENS, clouds, image
 
 BOX = ((0.05, 0.02, 0.03), (0.08, 0.06, 0.06))
@@ -108,3 +108,19 @@ def test_what_is_next_to_something_nearer_is_hidden_and_not_seen_through() -> No
     for u, expected in ((160, 1.0), (161, 1.0), (162, 0.0)):
         point = LENS.deproject((u, 120), 0.5)
         assert explain(point[None], STANDS, view).hidden == expected
+
+
+def test_a_cloud_makes_the_image_that_it_was_seen_in():
+    x, y = np.meshgrid(np.arange(0.0, 0.6, 0.003), np.arange(-0.3, 0.3, 0.003))
+    ground = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.4)])
+    on = (np.abs(ground[:, :2] - (0.3, 0.0)) < 0.03).all(axis=1)
+    camera, top = np.array([0.1, 0.1, 1.2]), ground[on] + (0.0, 0.0, 0.05)
+    for points, expected in (
+        (np.concatenate([ground, top]), (1.0, 0.0, 0.0)),
+        (ground, (0.0, 1.0, 0.0)),
+        (camera + 0.5 * (top - camera), (0.0, 0.0, 1.0)),  # something nearer hides it
+        (np.empty((0, 3)), (0.0, 0.0, 1.0)),
+        (2.0 * camera - ground, (0.0, 0.0, 1.0)),  # the camera looks away
+    ):
+        shares = explain(top, np.eye(4), view_of(points, camera))
+        assert (shares.seen, shares.free, shares.hidden) == pytest.approx(expected, abs=0.02)
