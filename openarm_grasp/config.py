@@ -124,15 +124,6 @@ class HeldConfig(Config):
     moved: float = Field(
         default=0.012, gt=0.0, le=0.1, description="an object seen this far out of its place has moved, m"
     )
-    in_view: float = Field(
-        default=0.1, gt=0.0, le=1.0, description="share of its points in view from which on an object is judged by them"
-    )
-    gone: float = Field(
-        default=0.5,
-        gt=0.0,
-        le=1.0,
-        description="share of those seen through from which on it has left its place",
-    )
 
 
 class DetectConfig(Config):

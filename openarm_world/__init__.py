@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from openarm_world.objects import Track as Track
     from openarm_world.shares import Shares as Shares
     from openarm_world.shares import explain as explain
+    from openarm_world.shares import fit as fit
     from openarm_world.shares import view_of as view_of
 
 __getattr__, __dir__ = attach(__name__, __file__)

@@ -17,10 +17,14 @@ from openarm_world.config import WorldConfig
 
 #: States of points.
 SEEN, FREE, HIDDEN = np.int8(1), np.int8(-1), np.int8(0)
-#: Pixel of the image that a cloud makes, rad: clouds leave out every second row and column of a camera.
-_PIXEL = 0.004
+#: Pixel of the image that a cloud makes, rad: three reach from a point to the next one, where clouds have every second.
+_PIXEL = 0.002
 #: Half the width of that image, pixels: 50 degrees.
-_HALF = 300
+_HALF = 600
+#: Steps of the search for a shift, m; rounds of each; more points say nothing new.
+_STEPS, _ROUNDS, _POINTS = (0.008, 0.004, 0.002, 0.001), 8, 500
+#: Shifts whose shares differ by less explain an image as well.
+_AS_WELL = 0.01
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,45 @@ def explain(points: Array, T_motion: Array, view: DepthView, config: WorldConfig
     n = max(len(state), 1)
     seen, free = np.count_nonzero(state == SEEN) / n, np.count_nonzero(state == FREE) / n
     return Shares(seen, free, 1.0 - seen - free)
+
+
+def fit(
+    points: Array,
+    T_motion: Array,
+    view: DepthView,
+    config: WorldConfig = WorldConfig(),  # noqa: B008 - frozen
+) -> tuple[Array, Shares]:
+    """Find the shift (3,) after a motion, m, with which most points are seen and fewest seen through; and the shares.
+
+    By coordinate descent from no shift on, and then to the middle of what explains the image as well; arguments as
+    `explain`. Where something has come to rest a little elsewhere, or its camera is a little elsewhere than believed,
+    the shift says by how much, and the shares judge the shape.
+    """
+    some, shift = points[:: max(1, len(points) // _POINTS)], np.zeros(3)
+
+    def shares_at(d: Array) -> Shares:
+        return explain(some, se3.make(p=d) @ T_motion, view, config)
+
+    def score(d: Array) -> float:
+        shares = shares_at(d)
+        return shares.seen - 0.5 * shares.free
+
+    best = score(shift)
+    for step in _STEPS:
+        for _ in range(_ROUNDS):
+            before = best
+            for way in (*np.eye(3), *-np.eye(3)):
+                if (now := score(shift + step * way)) > best:
+                    best, shift = now, shift + step * way
+            if best == before:
+                break
+    for axis in np.eye(3):
+        ends = [0, 0]
+        for k, way in enumerate((axis, -axis)):
+            while ends[k] < _ROUNDS and score(shift + (ends[k] + 1) * _STEPS[-1] * way) > best - _AS_WELL:
+                ends[k] += 1
+        shift = shift + 0.5 * (ends[0] - ends[1]) * _STEPS[-1] * axis
+    return shift, shares_at(shift)
 
 
 def view_of(points: Floats, camera: Array) -> DepthView:

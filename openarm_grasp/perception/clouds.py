@@ -12,12 +12,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from openarm_common import se3
-from openarm_common.detection import Detection, gap
+from openarm_common.detection import Detection
 from openarm_common.types import Array, Floats
-from openarm_grasp.evidence.shapes import Cluster
-from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart
+from openarm_grasp.perception.detections import NEXT_TO, Frame, Sighting
 from openarm_grasp.perception.sightings import divided, in_box, joined, object_points, points_around
-from openarm_world.shares import HIDDEN, SEEN, look, view_of
+from openarm_world.shares import FREE, HIDDEN, SEEN, look, view_of
 
 #: A place is in view where a point lies this near to it, seen from above, m.
 _IN_VIEW = 0.025
@@ -31,48 +30,21 @@ _PART, _MOST = 0.008, 0.5
 _NEXT_CELL = 1.8
 #: What stayed of a thing is another one where it was this share of it: of less, its neighbours may be seen there.
 _LEFT = 0.15
+#: What came next to an object has more than this share of its points: fewer are flying pixels.
+_CAME = 0.1
 #: Fewer points are no cluster.
 _LEAST_POINTS = 30
 
 
-def cluster_of(sighting: Sighting) -> Cluster:
-    """Return what the newest image shows of the object.
-
-    Raises:
-        OpenArmError: NOTHING_DETECTED, when it has no points.
-    """
-    points = object_points(sighting.clouds[-1:])
-    return Cluster.of(points, cut=not sighting.target.measured)
-
-
-def nearest_to(frames: Sequence[Frame], p_base: Array) -> tuple[Detection | None, Array]:
-    """Return the detection nearest to a place in the newest frame, and its points (n, 3); none without a cloud.
-
-    Args:
-        frames: In the base frame.
-        p_base: (2,) or (3,) about the middle of it.
-    """
-    frame = next((frame for frame in reversed(frames) if frame.cloud is not None), None)
-    if frame is None or frame.cloud is None or not frame.detections:
+def shown_at(frame: Frame, points: Array) -> tuple[Detection | None, Array]:
+    """Return the detection that most of what is seen at points (n, 3) belongs to, and its points; none where none."""
+    if frame.cloud is None:
         return None, np.empty((0, 3))
-    away = [float(np.linalg.norm((d.p_base - p_base)[:2])) for d in frame.detections]
-    number = int(np.argmin(away))
-    if away[number] >= SAME_PLACE:
+    there = frame.cloud.labels[_away(frame.cloud.points, points) < _PART]
+    number = int(np.bincount(there).argmax()) if len(there) else 0
+    if not number:
         return None, np.empty((0, 3))
-    points = frame.cloud.points[frame.cloud.labels == number + 1].astype(np.float64)
-    return frame.detections[number], points
-
-
-def clusters_of(frame: Frame) -> tuple[Cluster, ...]:
-    """Return what an image shows of each thing of which it has points enough; nothing without a cloud."""
-    cloud, found = frame.cloud, list[Cluster]()
-    if cloud is None:
-        return ()
-    for number, detection in enumerate(frame.detections, start=1):
-        points = cloud.points[cloud.labels == number].astype(np.float64)
-        if len(points) >= _LEAST_POINTS:
-            found.append(Cluster.of(points, cut=not detection.measured))
-    return tuple(found)
+    return frame.detections[number - 1], frame.cloud.points[frame.cloud.labels == number].astype(np.float64)
 
 
 def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Array:
@@ -86,8 +58,8 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
         sighting: The thing as it stood.
         rise: Its upper end is at least this much higher, m.
     """
-    before = cluster_of(sighting)
-    place = KDTree(object_points(sighting.clouds[-1:])[:, :2])
+    before = object_points(sighting.clouds[-1:])
+    place, top, middle = KDTree(before[:, :2]), _top(before), before.mean(axis=0)
     frame = next((frame for frame in reversed(frames) if frame.cloud is not None), None)
     found = [np.empty((0, 3))]
     if frame is not None and frame.cloud is not None:
@@ -97,10 +69,10 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
                 continue
             # of what hangs in a hand an end may be all that is seen; a few points that fly make it no neighbour
             beside = float(np.percentile(place.query(points[:, :2])[0], 2.0))
-            if Cluster.of(points).top - before.top >= rise and beside <= _IN_VIEW:
+            if _top(points) - top >= rise and beside <= _IN_VIEW:
                 found.append(points)
     clouds, points = sighting.clouds[-1:], np.concatenate(found)
-    points = points[np.linalg.norm(points - before.centroid, axis=1) < _REACH]
+    points = points[np.linalg.norm(points - middle, axis=1) < _REACH]
     off, _ = KDTree(np.concatenate([object_points(clouds), points_around(clouds)])).query(points)
     return points[off > _STOOD]
 
@@ -152,6 +124,11 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
     return divided(whole, left)
 
 
+def _top(points: Array) -> float:
+    """Height of the upper end of points (n, 3), m; a few that fly do not make it."""
+    return float(np.percentile(points[:, 2], 98.0))
+
+
 def _away(points: Array | Floats, others: Array | Floats) -> Array:
     """How far (n,) points (n, 3) are from the nearest of others (m, 3), m."""
     return np.full(len(points), np.inf) if not len(others) else np.asarray(KDTree(others).query(points)[0])
@@ -179,15 +156,19 @@ def _is_part(
     return bool(there >= _LEAST_POINTS // 2 and there > _MOST * seen and stayed < _MOST * len(points))
 
 
-def came_next_to(now: Detection, before: Sequence[Detection], frames: Sequence[Frame], reach: float) -> bool:
-    """Whether something is seen next to a thing that was not there before.
+def came_next_to(now: Array, frame: Frame, before: Sighting) -> bool:
+    """Whether something is seen next to an object that was not there before.
 
     Args:
-        now: The thing, as a frame shows it.
-        before: What was seen around before.
-        frames: Of which one has it.
-        reach: What is this near to it is next to it, m.
+        now: (n, 3) points of the object in the frame.
+        frame: Taken after the place.
+        before: The object and what was around it; what that image saw through was free.
     """
-    frame = next(frame for frame in reversed(frames) if any(d is now for d in frame.detections))
-    near = (d for d in frame.detections if d is not now and gap(d, now) < reach)
-    return any(all(apart(d, other) > SAME_PLACE for other in before) for d in near)
+    if frame.cloud is None:
+        return False
+    others = frame.cloud.points[frame.cloud.labels > 0].astype(np.float64)
+    away = _away(others, now)
+    near = others[(away > 0.0) & (away < NEXT_TO)]
+    old = before.clouds[0]
+    came = look(near, np.eye(4), view_of(old.points, old.camera)) == FREE
+    return bool(np.count_nonzero(came) > _CAME * len(now))

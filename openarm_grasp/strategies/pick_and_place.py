@@ -22,7 +22,7 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.shapes import heavier_end, judge_gone, judge_held, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict, Verdict
-from openarm_grasp.perception.clouds import lifted, nearest_to, risen_points
+from openarm_grasp.perception.clouds import lifted, risen_points
 from openarm_grasp.perception.detections import Frame, apart
 from openarm_grasp.perception.sightings import first_points, object_points, points_around
 from openarm_grasp.planning.candidates import PlaceTarget
@@ -234,11 +234,9 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[
 
 
 def _still(grasp: Grasp, frames: Sequence[Frame], config: GraspConfig) -> tuple[bool, str]:
-    """Whether the object still stands where it was seen; of what is no box, the points are compared."""
-    if grasp.of_cloud:
-        _, now = nearest_to(frames, grasp.sighting.target.p_base)
-        clouds = grasp.sighting.clouds
-        return judge_unmoved(object_points(clouds), now, config.held, points_around(clouds))
+    """Whether the object still stands where it was seen; a camera without depth compares boxes."""
+    if grasp.sighting.clouds:
+        return judge_unmoved(first_points(grasp.sighting), frames)
     return verdicts.judge_still(grasp.sighting.target, frames, config.held)
 
 
@@ -309,7 +307,7 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
         thing = lifted(frames, sighting, points, moved, T_before[:3, 3])
         if thing is not sighting:
             grasp = run.grasp = regrasped(run, grasp, thing)
-        camera = judge_gone(first_points(thing), frames, config.held)
+        camera = judge_gone(first_points(thing), frames)
         if camera.ok:
             before = np.concatenate([object_points(sighting.clouds), points_around(sighting.clouds)])
             where = judge_held(columns(before, run.context.table.top_z), points, moved, config.held)

@@ -122,16 +122,16 @@ def test_among_other_things_the_place_is_planned_before_the_lift(recorded: Recor
 def test_one_image_that_shows_it_at_its_place_is_enough(recorded: Recordings, monkeypatch) -> None:
     """The newest of three shows only a part of it, as it may of a thin thing."""
     robot, _, _ = kept_banana(recorded)
-    seen_in, asked = verify._seen_whole, list[int]()
+    seen_in, asked = verify._seen, list[int]()
 
     def in_part(frame: Frame, *args) -> CameraVerdict:
         asked.append(1)
         return CameraVerdict(Code.PLACE_FAILED, "in part") if len(asked) == 1 else seen_in(frame, *args)
 
-    monkeypatch.setattr(verify, "_seen_whole", in_part)
+    monkeypatch.setattr(verify, "_seen", in_part)
     outcome = robot.ask(phase="place")
     assert (outcome.success, outcome.attempts, len(asked)) == (True, 1, 2), outcome.message
-    assert "the cluster is" in outcome.message
+    assert "its middle is seen" in outcome.message
 
 
 def test_what_has_turned_in_the_hand_is_put_down_and_not_said_to_be_placed_by_that(recorded: Recordings) -> None:
@@ -149,7 +149,7 @@ def test_what_is_seen_away_from_its_target_is_not_said_to_be_placed(recorded: Re
     robot.session.kept[arm] = replace(kept, candidate=replace(kept.candidate, T_base_tcp=shifted))
     outcome = robot.ask(phase="place")
     assert outcome.attempts == 2, outcome.message
-    assert "mm from its target, expected at most 15 mm" in robot.said
+    assert "mm from where it was put down, expected at most 15 mm" in robot.said
 
 
 @pytest.mark.long

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evidence for things of any shape: interval of the aperture, clusters that left their place and rest at the target."""
+"""Evidence for things of any shape: interval of the aperture; they have left their place, and rest at the target."""
 
 from __future__ import annotations
 
@@ -10,21 +10,12 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.detection import Detection
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.evidence.shapes import (
-    Cluster,
-    is_more,
-    judge_gone,
-    judge_held,
-    judge_moved,
-    judge_rests,
-    judge_unmoved,
-    stays,
-)
+from openarm_grasp.evidence.shapes import judge_gone, judge_held, judge_moved, judge_unmoved, stays
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
-from openarm_grasp.perception.clouds import came_next_to, lifted, risen_points
+from openarm_grasp.perception.clouds import came_next_to, lifted, risen_points, shown_at
 from openarm_grasp.perception.detections import Frame, Sighting
 from openarm_grasp.perception.sightings import joined, object_points
 from openarm_grasp.planning.candidates import GraspCandidate
@@ -32,7 +23,6 @@ from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.requests.task import Grasp
 
 HELD = HeldConfig()
-STOOD = Cluster(np.array([0.27, -0.2, 0.42]), 0.44, 0.12, 800)
 
 
 def grip(gap, **kwargs):
@@ -64,72 +54,6 @@ def test_the_gap_after_closing_is_the_reference_for_slip():
     assert "34.5 mm" in lost.reason
     assert "30.0 mm" in lost.reason
     assert grip(0.0155, was_held=True, closed=0.0172).ok  # no longer the interval
-
-
-def at(x, y, **changes):
-    return replace(STOOD, centroid=np.array([x, y, STOOD.centroid[2]]), **changes)
-
-
-@pytest.mark.parametrize(
-    ("clusters", "code", "words"),
-    [
-        ([at(0.31, 0.101)], Code.OK, "mm from its target"),
-        ([at(0.33, 0.1)], Code.PLACE_FAILED, "30 mm from its target"),
-        ([at(0.30, 0.1, top=0.455)], Code.PLACE_FAILED, "15 mm higher"),
-        ([at(0.30, 0.1, top=0.43)], Code.PLACE_FAILED, "10 mm lower"),
-        ([at(0.30, 0.1, extent=0.16)], Code.PLACE_FAILED, "40 mm longer"),
-        ([at(0.30, 0.1, extent=0.08)], Code.PLACE_FAILED, "40 mm shorter"),
-        ([at(0.30, 0.1, extent=0.099)], Code.PLACE_FAILED, "21 mm shorter"),
-        ([at(0.30, 0.1, cut=True)], Code.PLACE_FAILED, "cut off"),
-        ([at(0.30, 0.1, points=100)], Code.PLACE_FAILED, "not in view"),
-        ([], Code.PLACE_FAILED, "not in view"),
-    ],
-)
-def test_a_thing_rests_where_its_middle_is_as_high_and_as_long_as_before(clusters, code, words):
-    verdict = judge_rests(STOOD, np.array([0.30, 0.1]), clusters, 0.02)
-    assert verdict.code is code
-    assert words in verdict.reason
-
-
-def test_the_middle_is_that_of_the_outline_however_many_points_are_on_one_end():
-    x, y = np.meshgrid(np.linspace(0.0, 0.2, 41), np.linspace(0.0, 0.04, 9))
-    plate = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.42)])
-    one_end = np.concatenate([plate, np.repeat(plate[plate[:, 0] < 0.05], 5, axis=0)])
-    cluster = Cluster.of(one_end)
-    assert cluster.centroid[0] < 0.08
-    assert cluster.away_from(np.array([0.1, 0.02])) < 0.001
-    verdict = judge_rests(Cluster.of(plate), np.array([0.1, 0.02]), [cluster], 0.015)
-    assert verdict.ok, verdict.reason
-
-
-def test_what_was_cut_off_when_it_was_first_seen_is_never_said_to_be_placed():
-    verdict = judge_rests(replace(STOOD, cut=True), np.array([0.30, 0.1]), [at(0.30, 0.1)], 0.02)
-    assert verdict.code is Code.PLACE_FAILED
-
-
-@pytest.mark.requirement("R-16")
-def test_what_lay_on_something_else_may_rest_lower_and_longer():
-    p = np.array([0.30, 0.1])
-    lower, higher, short = at(0.30, 0.1, top=0.428, extent=0.16), at(0.30, 0.1, top=0.455), at(0.30, 0.1, extent=0.08)
-    assert not judge_rests(STOOD, p, [lower], 0.02).ok
-    assert judge_rests(STOOD, p, [lower], 0.02, leaned=True).ok
-    assert not judge_rests(STOOD, p, [higher], 0.02, leaned=True).ok
-    assert not judge_rests(STOOD, p, [short], 0.02, leaned=True).ok
-
-
-def test_a_cluster_is_measured_without_its_few_flying_points():
-    rng = np.random.default_rng(3)
-    points = np.column_stack(
-        [rng.uniform(0.2, 0.3, 2000), rng.uniform(-0.22, -0.18, 2000), rng.uniform(0.4, 0.44, 2000)]
-    )
-    points[::200] += (0.0, 0.0, 0.3)
-    points[5] = np.nan
-    cluster = Cluster.of(points.reshape(-1, 10, 3))
-    assert cluster.points == 1999
-    assert cluster.top == pytest.approx(0.44, abs=0.002)
-    assert cluster.extent == pytest.approx(0.1, abs=0.006)
-    with pytest.raises(OpenArmError, match="without finite points"):
-        Cluster.of(np.full((4, 3), np.nan))
 
 
 def test_a_grasp_judges_its_hand_by_its_interval_and_by_how_far_it_had_closed():
@@ -173,32 +97,6 @@ def test_what_hangs_in_the_hand_may_have_been_hidden_below_what_was_seen():
 def slab(x, y, half=(0.05, 0.02), top=0.44, n=1500):
     rng = np.random.default_rng(int(1e3 * (x + 2 * y)) % 97)
     return np.column_stack([x + half[0] * rng.uniform(-1, 1, n), y + half[1] * rng.uniform(-1, 1, n), np.full(n, top)])
-
-
-@pytest.mark.parametrize(("off", "code"), [(0.0, Code.OK), (0.004, Code.OK), (0.03, Code.PLACE_FAILED)])
-def test_what_was_seen_in_part_must_be_seen_where_the_hand_has_moved_it(off, code):
-    part = slab(0.27, -0.2)
-    part = part[part[:, 0] < 0.27]  # the other half was hidden
-    T = se3.make(se3.rot_z(0.7), (0.1, 0.3, 0.0))
-    now = slab(0.27 + off, -0.2) @ T[:3, :3].T + T[:3, 3]
-    assert judge_moved(part, T, now, HELD.moved).code is code
-    assert judge_moved(part, T, np.empty((0, 3)), HELD.moved).code is Code.PLACE_FAILED
-
-
-@pytest.mark.parametrize(("hidden", "more"), [(0.0, False), (0.01, False), (0.05, True)])
-def test_what_is_larger_at_its_place_was_seen_in_part(hidden, more):
-    part = slab(0.27, -0.2)
-    part = part[part[:, 0] < 0.32 - hidden]
-    T = se3.make(se3.rot_z(0.7), (0.1, 0.3, 0.0))
-    assert is_more(slab(0.27, -0.2) @ T[:3, :3].T + T[:3, 3], part, T, HELD.moved) is more
-
-
-def test_what_came_next_to_a_placed_thing_may_be_a_part_of_it():
-    size = np.array([0.06, 0.06, 0.04])
-    thing, stood = (Detection("anything", 0.9, se3.make(p=(x, -0.2, 0.42)), size) for x in (0.3, 0.38))
-    part = Detection("anything", 0.9, se3.make(p=(0.3, -0.12, 0.41)), np.array([0.02, 0.08, 0.02]))
-    for seen, expected in (((thing,), False), ((thing, stood), False), ((thing, stood, part), True)):
-        assert came_next_to(thing, (stood,), [Frame(1, seen), Frame(2, ())], 0.03) is expected
 
 
 OVER = np.array([0.5, 0.0, 1.1])
@@ -325,13 +223,89 @@ def test_a_thing_with_its_part_is_one():
     assert whole.target.measured
 
 
+CARRIED = se3.make(se3.rot_z(0.7), (0.1, 0.1, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "words", "final"),
+    [
+        (se3.make(), Code.OK, " mm from where it was put down", False),
+        (se3.make(p=(0.0, 0.004, 0.001)), Code.OK, " mm from where it was put down", False),
+        (
+            se3.make(p=(0.012, 0.0, 0.0)),
+            Code.PLACE_FAILED,
+            "mm from where it was put down, expected at most 6",
+            False,
+        ),
+        (se3.make(p=(0.0, 0.0, 0.012)), Code.PLACE_FAILED, "12 mm higher than it was", True),
+        (se3.make(p=(0.0, 0.0, -0.012)), Code.PLACE_FAILED, "does not rest as it did", True),
+        (se3.make(p=(0.3, 0.3, 0.0)), Code.PLACE_FAILED, "does not rest as it did", True),  # it fell elsewhere
+    ],
+)
+def test_what_was_seen_is_seen_where_the_hand_has_moved_it(change, code, words, final):
+    frame = seen(se3.apply(change @ CARRIED, HANDLE))[0]
+    T, verdict = judge_moved(HANDLE, CARRIED, frame, 0.006)
+    assert (verdict.code, words in verdict.reason, verdict.final) == (code, True, final), verdict.reason
+    if verdict.ok:
+        assert pytest.approx(change @ CARRIED, abs=0.0021) == T
+
+
+def about(angle: float) -> np.ndarray:
+    """A turn about the vertical through the middle of the handle, before it is carried."""
+    middle = se3.make(p=HANDLE.mean(axis=0))
+    return CARRIED @ middle @ se3.make(se3.rot_z(angle)) @ se3.inverse(middle)
+
+
+@pytest.mark.parametrize(("angle", "code"), [(0.0, Code.OK), (0.03, Code.OK), (0.4, Code.PLACE_FAILED)])
+def test_what_has_turned_is_seen_through_where_it_should_be(angle, code):
+    verdict = judge_moved(HANDLE, CARRIED, seen(se3.apply(about(angle), HANDLE))[0], 0.006)[1]
+    assert verdict.code is code
+    assert verdict.ok or "does not rest as it did" in verdict.reason
+
+
+def test_what_is_hidden_at_its_place_or_has_no_points_is_not_said_to_be_placed():
+    there = se3.apply(CARRIED, HANDLE)
+    hidden = judge_moved(HANDLE, CARRIED, seen(OVER + 0.6 * (there - OVER))[0], 0.006)[1]
+    assert hidden.code is Code.PLACE_FAILED
+    assert "of what was seen of it is in view" in hidden.reason
+    assert judge_moved(HANDLE, CARRIED, Frame(1, ()), 0.006)[1].code is Code.STALE_DATA
+
+
+def test_what_is_shown_at_a_place_is_what_most_of_the_points_there_belong_to():
+    frame = seen(HANDLE, NEIGHBOUR)[0]
+    one, points = shown_at(frame, HANDLE)
+    assert one is frame.detections[0]
+    assert len(points) == len(HANDLE)
+    assert shown_at(frame, table()[:50])[0] is None
+    assert shown_at(frame, HANDLE + np.array([0.0, 0.0, 0.1]))[0] is None
+    assert shown_at(Frame(1, frame.detections), HANDLE)[0] is None
+
+
+def test_what_came_next_to_a_placed_thing_may_be_a_part_of_it():
+    before = Sighting(boxed(HEAD), (), 0, (seen(HEAD, NEIGHBOUR)[0].cloud,))
+    for others, expected in (((), False), ((NEIGHBOUR,), False), ((slab(0.27, -0.255, half=(0.05, 0.01)),), True)):
+        frame = seen(HANDLE, *others)[0]
+        assert came_next_to(shown_at(frame, HANDLE)[1], frame, before) is expected
+
+
 STANDING = seen(HANDLE, NEIGHBOUR)
 
 
-def test_a_part_that_was_seen_apart_before_has_not_moved():
-    now = np.concatenate([HANDLE, HEAD])
-    assert judge_unmoved(HANDLE, now, HELD, HEAD) == (True, "the object still stands there")
-    assert not judge_unmoved(HANDLE, now, HELD, NEIGHBOUR)[0]
+@pytest.mark.parametrize(
+    ("frames", "still", "words"),
+    [
+        (STANDING, True, "still stands"),
+        (seen(np.concatenate([HANDLE, HEAD]), NEIGHBOUR), True, "still stands"),  # a part that was seen apart before
+        (seen(OVER + 0.6 * (HANDLE - OVER)), True, "the hand hides"),
+        ([], True, "the hand hides"),
+        (seen(HANDLE + np.array([0.0, 0.012, 0.0])), False, "of it is not where it stood"),
+        (seen(NEIGHBOUR), False, "of it is not where it stood"),
+        (seen(NEIGHBOUR) + STANDING, True, "still stands"),
+    ],
+)
+def test_what_has_moved_is_seen_through_where_it_stood(frames, still, words):
+    said, why = judge_unmoved(HANDLE, frames)
+    assert (said, words in why) == (still, True), why
 
 
 @pytest.mark.parametrize(
@@ -348,6 +322,6 @@ def test_a_part_that_was_seen_apart_before_has_not_moved():
     ],
 )
 def test_an_object_has_gone_when_a_free_view_shows_its_place_empty(frames, code, words):
-    verdict = judge_gone(HANDLE, frames, HELD)
+    verdict = judge_gone(HANDLE, frames)
     assert (verdict.code, words in verdict.reason) == (code, True), verdict.reason
-    assert stays(HANDLE, frames, HELD) is (not any(judge_gone(HANDLE, [one], HELD).ok for one in frames))
+    assert stays(HANDLE, frames) is (not any(judge_gone(HANDLE, [one]).ok for one in frames))
