@@ -44,8 +44,10 @@ from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.settle import dropped
 from openarm_evaluation.campaign.tasks.things import object_sources
 from openarm_evaluation.judging.identity import IdentityScore
+from openarm_perception.detection.clouds import smooth_depth
+from openarm_perception.geometry.depth import DepthLimits, View
 from openarm_world.carried import Carrier
-from openarm_world.objects import Objects, Sight
+from openarm_world.objects import Objects
 from openarm_world.shares import explain
 
 #: Fewest pixels of a thing or an id, and farthest that the nearest centre is looked for, m.
@@ -78,10 +80,6 @@ class Lab(SimRobot):
         self._renderer.enable_segmentation_rendering()
         self._strip: tuple[slice, slice] | None = None
 
-    def _follow(self, name: str, stamp_ns: int, view: DepthView, cloud: LabelledCloud) -> Sight:
-        self._seen = view, cloud
-        return super()._follow(name, stamp_ns, view, cloud)
-
     def draw(self, name: str) -> tuple[NDArray[np.uint8], DepthImage]:
         """As of the robot, with what hides a part."""
         rgb, depth = super().draw(name)
@@ -103,7 +101,13 @@ class Lab(SimRobot):
             width = round(_STRIP * camera.intrinsics.fx / 0.8)
             left = int(rng.integers(camera.width // 4, 3 * camera.width // 4 - width))
             self._strip = slice(0, camera.height), slice(left, left + width)
-        assert self.detect(_CAMERA) is not None
+        frame = self.detect(_CAMERA)
+        assert frame is not None
+        assert frame.cloud is not None
+        one = self.cameras[_CAMERA]
+        seen = View(*self.draw(_CAMERA), one.intrinsics, self.camera_pose(one, self.t_ns))
+        smooth = smooth_depth(seen, DepthLimits(near=one.near, far=one.far))
+        view = DepthView(smooth, one.intrinsics, seen.T_base_camera, one.near, one.far)
         self._renderer.update_scene(self.data, _CAMERA)
         drawn = self._renderer.render()
         geom = np.where(drawn[..., 1] == int(mujoco.mjtObj.mjOBJ_GEOM), drawn[..., 0], -1)
@@ -111,7 +115,7 @@ class Lab(SimRobot):
         body = np.where(np.isin(body, [*self.bodies.values()]), body, 0)
         if self._strip is not None:
             body[self._strip] = 0
-        return Look(*self._seen, body.astype(np.int64), held)
+        return Look(view, frame.cloud, body.astype(np.int64), held)
 
     def pose(self, name: str) -> Array:
         """Pose of a thing (4, 4)."""

@@ -25,7 +25,6 @@ from openarm_common.camera.depth_view import DepthView
 from openarm_common.camera.housings import mounted
 from openarm_common.config import Config, load_config
 from openarm_common.errors import OpenArmError
-from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import per_robot
@@ -51,8 +50,8 @@ from openarm_motion.service.robot import Outcome
 from openarm_motion.timing.trajectory import Motion
 from openarm_octomap.grid import DepthScan
 from openarm_octomap.mapper import Frame as MapFrame
-from openarm_perception.detection.clouds import labelled_cloud, smooth_depth
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
+from openarm_perception.detection.follow import followed
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer
 from openarm_perception.detection.pipeline import Pipeline, make_pipeline
@@ -64,8 +63,8 @@ from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.stage import Stage
-from openarm_world.carried import carriers
-from openarm_world.objects import Objects, Sight
+from openarm_world.carried import Carrier, carriers
+from openarm_world.objects import Objects
 
 T = TypeVar("T")
 
@@ -342,20 +341,19 @@ class SimRobot:
         except OpenArmError:
             return None  # as the detector: the frame is skipped, the next may do
         limits = DepthLimits(near=camera.near, far=camera.far)
-        smooth = smooth_depth(seen, limits)
-        cloud = labelled_cloud(seen, smooth, perceived.boxes, limits).moved(T_base_camera)
-        sight = self._follow(name, stamp_ns, DepthView(smooth, optics, T_base_camera, limits.near, limits.far), cloud)
-        return Frame(stamp_ns, perceived.identified(sight.ids).boxes, cloud)
+        objects, perceived, cloud = followed(
+            self._objects[name], perceived, seen, limits, stamp_ns, self._carriers(stamp_ns)
+        )
+        self._objects[name] = objects
+        return Frame(stamp_ns, perceived.boxes, cloud.moved(T_base_camera))
 
-    def _follow(self, name: str, stamp_ns: int, view: DepthView, cloud: LabelledCloud) -> Sight:
-        """Follow the objects of a camera, as its detector does."""
+    def _carriers(self, stamp_ns: int) -> Mapping[str, Carrier] | None:
+        """What the hands hold at the stamp of an image; None when their posture is not known."""
         try:
             joints = self.states.joints_at(min(stamp_ns, self.states.latest()[0]))
-            held = carriers(self.description, joints, self.held)
+            return carriers(self.description, joints, self.held)
         except OpenArmError:
-            held = None
-        self._objects[name], sight = self._objects[name].update(view, cloud, stamp_ns, held)
-        return sight
+            return None
 
     def _watch(self, name: str) -> CameraWatch:
         camera = self.cameras[name]

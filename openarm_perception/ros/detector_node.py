@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from openarm_common.camera.depth_view import DepthImage, DepthView
 from openarm_common.camera.stream import Frame
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.resources import config_dir
 from openarm_common.robot.posture import JointNeed, Posture
 from openarm_common.ros.answers import answering
@@ -34,11 +32,10 @@ from openarm_common.ros.images import array_to_image, color_of, depth_of, is_rec
 from openarm_common.ros.labelled_clouds import labelled_cloud_to_msg
 from openarm_common.ros.node import QOS_LATCHED, QOS_SENSOR, BaseNode, reliable, run
 from openarm_common.ros.tf import RobotStateListener
-from openarm_common.types import Floats
 from openarm_perception.config import DetectNodeConfig
-from openarm_perception.detection.clouds import labelled_cloud, smooth_depth
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.detection.draw import annotate
+from openarm_perception.detection.follow import followed
 from openarm_perception.detection.localize import Localizer
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
 from openarm_perception.detection.pipeline import Perceived, Pipeline, make_pipeline
@@ -194,26 +191,16 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self._newest_at = time.monotonic()
             withheld = self._watch.look(frame.t_ns, self._newest, self.table_height)
             perceived = self._pipeline.run(rgb, depth, intrinsics, posture.T_base_frame, robot, withheld, frame.t_ns)
-            smooth = smooth_depth(self._newest, self._localizer.limits)
-            cloud = labelled_cloud(self._newest, smooth, perceived.boxes, self._localizer.limits)
-            perceived = perceived.identified(self._follow(smooth, intrinsics, cloud, frame))
+            held = None if self._uncut else carriers(self.description, posture.joints, posture.held)
+            self._followed, perceived, cloud = followed(
+                self._followed, perceived, self._newest, self._localizer.limits, frame.t_ns, held
+            )
         except OpenArmError as error:
             self._refuse(error)
             return
         if self._clouds.get_subscription_count():  # first, so that whoever waits for the objects has them
             self._clouds.publish(labelled_cloud_to_msg(cloud, self._optical_frame, frame.t_ns))
         self._publish(frame.t_ns, rgb, perceived, (time.perf_counter() - started) * 1e3)
-
-    def _follow(
-        self, smooth: Floats, intrinsics: Intrinsics, cloud: LabelledCloud, frame: Frame[Any]
-    ) -> Mapping[int, str]:
-        """Return the ids of the objects of a frame."""
-        posture, limits = frame.posture, self._localizer.limits
-        view = DepthView(smooth, intrinsics, posture.T_base_frame, limits.near, limits.far)
-        held = None if self._uncut else carriers(self.description, posture.joints, posture.held)
-        in_base = cloud.moved(posture.T_base_frame)
-        self._followed, sight = self._followed.update(view, in_base, frame.t_ns, held)
-        return sight.ids
 
     def _find_robot(self, depth: DepthImage, intrinsics: Intrinsics, posture: Posture) -> Mask | None:
         if self._robot is None:
