@@ -21,9 +21,9 @@ SEEN, FREE, HIDDEN = np.int8(1), np.int8(-1), np.int8(0)
 _PIXEL = 0.002
 #: Half the width of that image, pixels: 50 degrees.
 _HALF = 600
-#: Steps of the search for a shift, m; rounds of each; more points say nothing new.
+#: Steps of the search for a motion, m; rounds of each; more points say nothing new.
 _STEPS, _ROUNDS, _POINTS = (0.008, 0.004, 0.002, 0.001), 8, 500
-#: Shifts whose shares differ by less explain an image as well.
+#: Motions whose shares seen differ by less explain an image as well.
 _AS_WELL = 0.01
 
 
@@ -72,38 +72,49 @@ def fit(
     T_motion: Array,
     view: DepthView,
     config: WorldConfig = WorldConfig(),  # noqa: B008 - frozen
+    *,
+    turns: bool = True,
 ) -> tuple[Array, Shares]:
-    """Find the shift (3,) after a motion, m, with which most points are seen and fewest seen through; and the shares.
+    """Find the motion (4, 4) near to one with which most points are seen, and the shares.
 
-    By coordinate descent from no shift on, and then to the middle of what explains the image as well; arguments as
-    `explain`. Where something has come to rest a little elsewhere, or its camera is a little elsewhere than believed,
-    the shift says by how much, and the shares judge the shape.
+    By coordinate descent, and then to the middle of what explains the image as well. Where something has come to rest a
+    little elsewhere, or its camera is a little elsewhere than believed, the motion says by how much, and the shares
+    judge the shape.
+
+    Args:
+        points: As of `explain`.
+        T_motion: As of `explain`.
+        view: As of `explain`.
+        config: As of `explain`.
+        turns: Whether it may have turned about the vertical, too, and not only shifted.
     """
-    some, shift = points[:: max(1, len(points) // _POINTS)], np.zeros(3)
+    some = points[:: max(1, len(points) // _POINTS)]
+    middle = se3.apply(T_motion, some).mean(axis=0)
+    reach = max(float(np.linalg.norm(some - some.mean(axis=0), axis=1).max()), _STEPS[0])  # its ends turn by a step
 
-    def shares_at(d: Array) -> Shares:
-        return explain(some, se3.make(p=d) @ T_motion, view, config)
+    def moved(x: Array) -> Array:
+        return se3.make(se3.rot_z(x[3] / reach), middle + x[:3]) @ se3.make(p=-middle) @ T_motion
 
-    def score(d: Array) -> float:
-        shares = shares_at(d)
-        return shares.seen - 0.5 * shares.free
+    def score(x: Array) -> float:
+        return explain(some, moved(x), view, config).seen
 
-    best = score(shift)
+    x, axes = np.zeros(4), np.eye(4)[: 3 + turns]
+    best = score(x)
     for step in _STEPS:
         for _ in range(_ROUNDS):
             before = best
-            for way in (*np.eye(3), *-np.eye(3)):
-                if (now := score(shift + step * way)) > best:
-                    best, shift = now, shift + step * way
+            for way in (*axes, *-axes):
+                if (now := score(x + step * way)) > best:
+                    best, x = now, x + step * way
             if best == before:
                 break
-    for axis in np.eye(3):
+    for axis in axes:
         ends = [0, 0]
         for k, way in enumerate((axis, -axis)):
-            while ends[k] < _ROUNDS and score(shift + (ends[k] + 1) * _STEPS[-1] * way) > best - _AS_WELL:
+            while ends[k] < _ROUNDS and score(x + (ends[k] + 1) * _STEPS[-1] * way) > best - _AS_WELL:
                 ends[k] += 1
-        shift = shift + 0.5 * (ends[0] - ends[1]) * _STEPS[-1] * axis
-    return shift, shares_at(shift)
+        x = x + 0.5 * (ends[0] - ends[1]) * _STEPS[-1] * axis
+    return moved(x), explain(some, moved(x), view, config)
 
 
 def view_of(points: Floats, camera: Array) -> DepthView:

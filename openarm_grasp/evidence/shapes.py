@@ -24,12 +24,12 @@ from openarm_world.shares import explain, fit, view_of
 
 #: From which shares on an object is judged, and has left its place.
 _WORLD = WorldConfig()
-#: A thing that rests as it rested is as high as before, m; of what was seen of it and is in view so much is there.
-_HEIGHT, _OTHERWISE = 0.005, 0.03
+#: A thing that rests as it rested is as high as before, m.
+_HEIGHT = 0.005
+#: What has moved by 8 mm, or rests otherwise, is seen through by more than this share; what stands under a hand is not.
+_MOVED = 0.1
 #: What is less in view is not judged: from another side, a third may be.
 _SHOWN = 0.3
-#: What has moved by 8 mm is seen through by more than this share; what stands under a hand is not.
-_MOVED = 0.1
 #: Of the points of a thing that has not moved so many lie where it was, %: the rest may be the edge of the hand.
 _MOST = 85.0
 #: Fewer points of what hangs in a hand may be of its edge, or of something else.
@@ -133,7 +133,9 @@ def judge_unmoved(before: Array, frames: Sequence[Frame]) -> tuple[bool, str]:
     return True, "the object still stands there"
 
 
-def judge_moved(before: Array, T_motion: Array, frame: Frame, within: float) -> tuple[Array, CameraVerdict]:
+def judge_moved(
+    before: Array, T_motion: Array, frame: Frame, within: float, *, in_part: bool
+) -> tuple[Array, CameraVerdict]:
     """Whether an object is seen where the hand has moved it, and rests as it did.
 
     Args:
@@ -141,22 +143,24 @@ def judge_moved(before: Array, T_motion: Array, frame: Frame, within: float) -> 
         T_motion: (4, 4) how the hand has moved it.
         frame: Taken after the hand has left it.
         within: Greatest horizontal distance, m.
+        in_part: There may be more of it, that has moved otherwise where it has turned: it may not.
 
     Returns:
         How it has moved as it is seen (4, 4), and the verdict; final where it has fallen over, or is another shape.
     """
-    if frame.cloud is None:
+    if frame.cloud is None or not len(before):
         return T_motion, CameraVerdict(Code.STALE_DATA, "no points of what stands where it was put down")
-    shift, shares = fit(before, T_motion, view_of(frame.cloud.points, frame.cloud.camera))
-    T, off, higher = se3.make(p=shift) @ T_motion, float(np.linalg.norm(shift[:2])), float(shift[2])
+    T, shares = fit(before, T_motion, view_of(frame.cloud.points, frame.cloud.camera), turns=not in_part)
+    shift = (se3.apply(T, before) - se3.apply(T_motion, before)).mean(axis=0)
+    off, higher = float(np.linalg.norm(shift[:2])), float(shift[2])
     text, final = f"what was seen of it is {off * 1e3:.0f} mm from where it was put down", False
     if shares.in_view < _SHOWN:
         text = f"{shares.in_view:.0%} of what was seen of it is in view after the place, expected at least {_SHOWN:.0%}"
-    elif shares.left > _OTHERWISE:
-        final, limit = True, f"expected at most {_OTHERWISE:.0%}"
+    elif shares.left > _MOVED:
+        final, limit = not in_part, f"expected at most {_MOVED:.0%}"
         text = f"the object does not rest as it did: {shares.left:.0%} of what was seen of it is not there, {limit}"
     elif abs(higher) > _HEIGHT:
-        final, way = True, "higher" if higher > 0.0 else "lower"
+        final, way = not in_part, "higher" if higher > 0.0 else "lower"
         text = f"the object does not rest as it did: it is {abs(higher) * 1e3:.0f} mm {way} than it was"
     elif off > within:
         text = f"{text}, expected at most {within * 1e3:.0f} mm"

@@ -112,9 +112,9 @@ def _seen(frame: Frame, run: Run, grasp: Grasp, target: PlaceTarget) -> CameraVe
     in_part = not before.measured or any(gap(d, before) < NEXT_TO for d in grasp.sighting.others)
     tolerance = _SEEN_WITHIN * run.config.place.tolerance
     points, within = first_points(grasp.sighting), _PART_WITHIN if in_part else tolerance
-    T_base_now, moved = judge_moved(points, grasp.motion_to(target), frame, within)
+    T_base_now, moved = judge_moved(points, grasp.motion_to(target), frame, within, in_part=in_part)
     if not moved.ok:
-        return replace(moved, final=moved.final and not in_part)
+        return moved
     now, seen = shown_at(frame, se3.apply(T_base_now, points))
     if now is None or not now.measured:
         return _unproven("the border of the image or another thing hides a part of it: its middle is not known")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.camera.depth_view import DepthView
-from openarm_world import Shares, explain, view_of
+from openarm_world import Shares, explain, fit, view_of
 from tests.openarm_world.made import ABOVE, LENS, clouds, image
 
 BOX = ((0.05, 0.02, 0.03), (0.08, 0.06, 0.06))
@@ -49,6 +49,27 @@ def test_what_was_pushed_is_seen_through_along_one_edge(step: float) -> None:
     assert shares.free == pytest.approx(step / edges[0], abs=0.07)
     assert shares.left > 0.015
     assert explain(points_of({1: BOX}), shift(step), view).left < 0.015
+
+
+@pytest.mark.parametrize("way", [(0.0, 0.0, 0.0), (0.010, -0.006, 0.0), (0.0, 0.0, 0.012), (0.03, 0.02, 0.0)])
+def test_the_motion_that_explains_an_image_best_says_how_far_a_thing_is_from_where_it_should_be(way) -> None:
+    middle, edges = BOX
+    view = image({1: (tuple(np.add(middle, way)), edges)}, noise=np.random.default_rng(1))[0]
+    for turns in (False, True):
+        T, shares = fit(points_of({1: BOX}), STANDS, view, turns=turns)
+        assert se3.apply(T, np.array(middle)) - middle == pytest.approx(way, abs=0.0055)  # one and a half pixels
+        assert shares.left < 0.015
+
+
+def test_a_turn_is_found_where_one_may_be() -> None:
+    """The camera has turned about the vertical through the thing, and is believed where it was."""
+    middle = se3.make(p=(BOX[0][0], BOX[0][1], 0.0))
+    turn = middle @ se3.make(se3.rot_z(0.2)) @ se3.inverse(middle)
+    view = image({1: BOX}, se3.inverse(turn) @ ABOVE)[0]
+    seen = DepthView(view.depth, LENS, ABOVE, 0.05, 3.0)
+    T, shares = fit(points_of({1: BOX}), STANDS, seen)
+    assert T[:2, :2] == pytest.approx(turn[:2, :2], abs=0.04)
+    assert shares.left < 0.015 < fit(points_of({1: BOX}), STANDS, seen, turns=False)[1].left
 
 
 def test_what_is_behind_an_arm_is_hidden_and_not_gone() -> None:
