@@ -82,7 +82,7 @@ def fit(
     judge the shape.
 
     Args:
-        points: As of `explain`.
+        points: (n, 3) as of `explain`, at least one.
         T_motion: As of `explain`.
         view: As of `explain`.
         config: As of `explain`.
