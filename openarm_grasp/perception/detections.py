@@ -40,8 +40,8 @@ _ON = 0.015
 _CLOUDS = 3
 #: What lies this near to points of an object is a piece of it, m.
 _PIECE = 0.010
-#: A point of an object is there in another frame with one as near to it, m; this share of all of them must be.
-_SAME_POINT, _MOST = 0.005, 0.95
+#: Of an object that has not moved more than this share is seen where it was; of one that has by 5 mm, less.
+_MOST = 0.95
 #: An object of fewer points has no cloud.
 _LEAST_POINTS = 60
 
@@ -286,12 +286,11 @@ def _stays(frames: Sequence[Frame], cloud: LabelledCloud) -> bool:
 
     Things that touch are one in some frames and several in others, and none of them has moved.
     """
-    mine, there = cloud.points[cloud.labels == 1], 0
-    for frame in frames:
-        if frame.cloud is not None and (standing := frame.cloud.points[frame.cloud.labels > 0]).size:
-            away, _ = _tree(standing).query(mine)
-            there += float(np.mean(away <= _SAME_POINT)) >= _MOST
-    return 3 * there >= 2 * len(frames)
+    from openarm_world.shares import explain, view_of  # as of `_tree`
+
+    mine = cloud.points[cloud.labels == 1].astype(np.float64)
+    views = (view_of(frame.cloud.points, frame.cloud.camera) for frame in frames if frame.cloud is not None)
+    return 3 * sum(explain(mine, np.eye(4), view).seen >= _MOST for view in views) >= 2 * len(frames)
 
 
 def _labelled(frame: Frame, detection: Detection) -> LabelledCloud | None:
