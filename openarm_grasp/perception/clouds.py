@@ -18,8 +18,8 @@ from openarm_grasp.perception.detections import NEXT_TO, Frame, Sighting
 from openarm_grasp.perception.sightings import divided, in_box, joined, object_points, points_around
 from openarm_world.shares import FREE, HIDDEN, SEEN, look, view_of
 
-#: A place is in view where a point lies this near to it, seen from above, m.
-_IN_VIEW = 0.025
+#: What hangs in a hand over the place of a thing is this near to it, seen from above, m.
+_OVER = 0.025
 #: What is seen this near to what stood there is that, m.
 _STOOD = 0.015
 #: Nothing that hangs in the hand reaches farther from where it stood, m.
@@ -69,7 +69,7 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
                 continue
             # of what hangs in a hand an end may be all that is seen; a few points that fly make it no neighbour
             beside = float(np.percentile(place.query(points[:, :2])[0], 2.0))
-            if _top(points) - top >= rise and beside <= _IN_VIEW:
+            if _top(points) - top >= rise and beside <= _OVER:
                 found.append(points)
     clouds, points = sighting.clouds[-1:], np.concatenate(found)
     points = points[np.linalg.norm(points - middle, axis=1) < _REACH]
