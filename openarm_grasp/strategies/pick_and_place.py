@@ -234,8 +234,8 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[
 
 
 def _still(grasp: Grasp, frames: Sequence[Frame], config: GraspConfig) -> tuple[bool, str]:
-    """Whether the object still stands where it was seen; a camera without depth compares boxes."""
-    if grasp.sighting.clouds:
+    """Whether the object still stands where it was seen; where no points are known, boxes are compared."""
+    if grasp.of_cloud or (grasp.sighting.clouds and any(frame.cloud is not None for frame in frames[-1:])):
         return judge_unmoved(first_points(grasp.sighting), frames)
     return verdicts.judge_still(grasp.sighting.target, frames, config.held)
 
