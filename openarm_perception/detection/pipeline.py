@@ -126,7 +126,7 @@ class Pipeline:
         check_size("depth image", depth.shape, intrinsics)
         unit_scale(depth)
         size = (intrinsics.width, intrinsics.height)
-        view = View(rgb, depth, intrinsics, T_base_camera, robot)
+        view = self.localizer.levelled(View(rgb, depth, intrinsics, T_base_camera, robot))
         detected = self.detect(view)
         found = rank(self.faults.seen(detected.found, t_ns), self.policy, size)
         doubts = self.faults.seen(detected.doubts, t_ns)
@@ -357,6 +357,9 @@ def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D |
     core &= standing & (solid if (solid & core).any() else True)
     if not core.any():
         return None
+    if view.levels is not None:  # neither what it stands on, nor what stands on it
+        standing &= view.levels.under[rows, columns] == view.levels.of((rows, columns), core)
+        core &= standing
     alike = _alike(view.rgb[rows, columns], core)
     plain = np.count_nonzero(alike & core) >= 0.5 * np.count_nonzero(core)
     # what is of many colours is separated from the background by depth alone
