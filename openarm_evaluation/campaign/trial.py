@@ -156,7 +156,7 @@ class Trials:
             for track in robot.tracks.values():
                 track.clear()
         robot.pass_time(0.1)
-        request = replace(ask, arm=task.arm, place=task.place)
+        request = replace(ask, arm=task.arm, place=task.place, place_on=task.place_on)
         try:
             outcome = self.link.run(carry_out(self.grasp_task(request)))
         except OpenArmError as error:
@@ -244,9 +244,18 @@ class Trials:
             name = min(lifted, key=lambda n: math.dist(robot.tracks[n][-1].p_world[:2], xy))
         if seen is not None and not outcome.attempts:  # nothing rose: that which was looked at
             name = min(names, key=lambda n: float(np.linalg.norm(robot.tracks[n][0].p_world - np.array(seen))))
-        corners = task.scene.object(name).corners
-        verdict = judge(robot.tracks[name], xy, claimed=outcome.success, corners=corners)
+        item, table = task.scene.object(name), task.scene.table
+        floor = item.centre(table)[2] - 0.5 * item.size[2]
+        higher = self._floor() - floor
+        verdict = judge(robot.tracks[name], xy, claimed=outcome.success, corners=item.corners, higher=higher)
         return Trial(task.scene, task.seed, name, outcome, verdict, steps, wall_s, end_ns)
+
+    def _floor(self) -> float:
+        """Height of what things are to stand on, m, by ground truth: the table, or the top of an object."""
+        if not self._task.place_on:
+            return self._task.scene.table.top_z
+        support = choose_targets(self._task.scene, self._task.place_on)[0]
+        return float(self.robot.tracks[support.name][-1].p_world[2] + 0.5 * support.size[2])
 
     def _rest(self, names: list[str]) -> None:
         end_ns = self.robot.t_ns + round(_REST_LIMIT_S * 1e9)

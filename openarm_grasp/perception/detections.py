@@ -42,6 +42,8 @@ _CLOUDS = 3
 _PIECE = 0.010
 #: A point of an object is there in another frame with one as near to it, m; this share of all of them must be.
 _SAME_POINT, _MOST = 0.005, 0.95
+#: What stands on another thing begins this far below the top of that at most, m.
+_STACKED = 0.005
 #: An object of fewer points has no cloud.
 _LEAST_POINTS = 60
 
@@ -74,6 +76,11 @@ class Sighting:
     others: tuple[Detection, ...]
     t_ns: int
     clouds: tuple[LabelledCloud, ...] = ()
+
+    @property
+    def beside(self) -> tuple[Detection, ...]:
+        """Others, without what the object stands on or what stands on it."""
+        return tuple(d for d in self.others if not stacked(d, self.target))
 
 
 class UntrustedError(OpenArmError):
@@ -118,6 +125,11 @@ def picked(frame: Frame, detections: Sequence[Detection]) -> Frame:
 def apart(a: Detection, b: Detection) -> float:
     """Horizontal distance of two objects, m."""
     return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
+
+
+def stacked(a: Detection, b: Detection) -> bool:
+    """Whether one of two objects ends about where the other begins, or lower."""
+    return min(a.top, b.top) <= max(a.bottom, b.bottom) + _STACKED
 
 
 def sticks_out(seen: Detection, stood: Detection) -> float:
@@ -388,7 +400,7 @@ _WHY = {
 }
 
 
-def on_table(d: Detection, table_z: float, *, reach: float = 0.03) -> Detection:
+def on_table(d: Detection, table_z: float, *, reach: float = 0.01) -> Detection:
     """Let a box that stands on the table end there: its top is measured, its bottom is usually hidden.
 
     Args:
@@ -426,6 +438,7 @@ def _others(
                     continue
             # The middle of what is seen of an object may lie near another one.
             rivals = (k for k in (target, *found) if k.label == d.label or (k.measured and d.measured))
+            rivals = (k for k in rivals if not stacked(k, d))
             if all(apart(d, known) > match_radius for known in rivals):
                 found.append(d)
     return tuple(found)

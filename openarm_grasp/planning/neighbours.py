@@ -18,8 +18,8 @@ from openarm_common.detection import gap
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.perception.sightings import in_box, object_points, points_around
-from openarm_grasp.planning.candidates import UP, Box, obstacle_boxes
+from openarm_grasp.perception.sightings import in_box, object_points, points_around, surface_of
+from openarm_grasp.planning.candidates import UP, Box, PlaceTarget, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
 
 #: Share of its hull that something without inward corners covers, seen from above.
@@ -37,13 +37,17 @@ _MOST, _SAVED = 20, 0.02
 _NEARER = 0.003
 #: What reaches over an object by no more than this slides off it when it is lifted, m.
 _OVER = 0.015
+#: A prism that is seen to be so much lower within its rim is hollow, m.
+_HOLLOW = 0.01
+#: What is put down on something is this near to the top of a box about that, m, which is taken so much lower.
+_FACE, _LOWER = 0.012, 0.002
 #: Fewer points say nothing of a shape.
 _LEAST_POINTS = 30
 
 
 def crowded(found: Sighting) -> bool:
     """Whether something stands so close to an object that it may keep a hand from it."""
-    return any(gap(found.target, one) < _CLOSE for one in found.others)
+    return any(gap(found.target, one) < _CLOSE for one in found.beside)
 
 
 def cornered(found: Sighting) -> bool:
@@ -70,7 +74,8 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     seen, parts = points_around(found.clouds), list[Box]()
     for one in found.others:
         whole = boxes[id(one)]
-        own = seen[in_box(seen, one)] if not (one.kind and one.measured) else seen[:0]
+        solid = one.kind and one.measured and surface_of(one, found) >= one.top - _HOLLOW
+        own = seen[:0] if solid else seen[in_box(seen, one)]
         if len(own) < _LEAST_POINTS:
             made = (whole,)
         else:
@@ -82,6 +87,17 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     for box in held:
         parts = [cut for part in parts if (cut := _not_over(part, box, config.approach.lift_height)) is not None]
     return tuple(parts)
+
+
+def under(parts: Sequence[Box], places: Sequence[PlaceTarget]) -> tuple[Box, ...]:
+    """Boxes to keep clear of, lowered where something is to be put down on them."""
+    spots, found = np.unique([place.position for place in places], axis=0), list[Box]()
+    for part in parts:
+        off = np.abs((spots - part.T_frame_box[:3, 3]) @ part.T_frame_box[:3, :3]) - 0.5 * part.size
+        on = (off[:, :2] <= _CLOSE).all(axis=1) & (np.abs(off[:, 2]) <= _FACE)
+        lost = min(_LOWER - float(off[on, 2].min(initial=_LOWER)), float(part.size[2]) - 1e-3)
+        found.append(_cut(part, 2, lost, top=True) if lost > 0.0 else part)
+    return tuple(found)
 
 
 def tops(points: Array) -> Array:

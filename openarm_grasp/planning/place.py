@@ -19,14 +19,20 @@ from openarm_common.detection import Detection, distances_from
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.work import Table
 from openarm_common.types import Array
+from openarm_common.wanted import describe, select
 from openarm_grasp.config import GraspConfig, PlaceConfig
 from openarm_grasp.evidence.verdicts import SQUARE_WITHIN
-from openarm_grasp.perception.detections import Frame
+from openarm_grasp.perception.detections import Frame, Sighting
+from openarm_grasp.perception.sightings import surface_of
 from openarm_grasp.planning.arms import Shoulders, sides
 from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, hold_of
 
 #: Spots nearer to each other than this are one, m.
 SAME_SPOT = 0.02
+#: An object may be so much wider than what it is placed on, on each side, m.
+_OVERHANG = 0.01
+#: Grid of spots there, their distance from what stands there, and room around that is enough for a hand, m.
+_SPOT_STEP, _NEXT, _HAND_ROOM = 0.02, 0.005, 0.08
 
 
 def place_targets(
@@ -43,7 +49,7 @@ def place_targets(
     Args:
         target: The object as it stood at the grasp.
         candidate: How it is held.
-        spots: (2,) or (3,) footprint centres, base frame, m, best first; z is not read.
+        spots: (3,) footprint centres on what it is to stand on, base frame, m, best first; (2,): as high as it stood.
         config: Parameters.
         used: Targets that have failed before: their spots (where there are others) or turns come last.
         yaw: Yaw of the object's x axis about the base z when it stands there, rad; None: any.
@@ -61,14 +67,14 @@ def place_targets(
     order = sorted(ranked, key=lambda r: r[0])
     found: list[PlaceTarget] = []
     for rank, i, yaw in order:
-        x, y = float(spots[i][0]), float(spots[i][1])
-        p = np.array([x, y, target.p_base[2] + config.place.release_height])
+        foot = np.array([*spots[i], target.bottom][:3], dtype=np.float64)
+        p = foot + (target.p_base[2] - target.bottom + config.place.release_height) * UP
         T_base_tcp = se3.make(se3.rot_z(yaw) @ target.T_base_object[:3, :3], p) @ T_object_tcp
         found.append(
             PlaceTarget(
                 id=f"spot{i}/yaw{np.degrees(yaw):+.0f}",
                 T_base_tcp=T_base_tcp,
-                position=np.array([x, y, target.bottom]),
+                position=foot,
                 yaw_offset=yaw,
                 approach_offset=config.approach.pregrasp_distance * UP,
                 retreat_offset=-config.approach.pregrasp_distance * T_base_tcp[:3, 2],
@@ -263,6 +269,47 @@ def check_position(position: Sequence[float], target: Detection, others: Sequenc
                 f" {target.label!r} does not fit there",
             )
     return p
+
+
+def spots_on(name: str, found: Sighting, config: PlaceConfig) -> tuple[Array, ...]:
+    """Free spots on the top of something in view, or in it, best first: those with most room around, then the middle.
+
+    Args:
+        name: Words for it.
+        found: The object that is to stand there, and what is around it.
+        config: How many spots are offered.
+
+    Returns:
+        (3,) footprint centres on its surface, base frame, m.
+
+    Raises:
+        OpenArmError: UNKNOWN_OBJECT or NOTHING_DETECTED, naming what may carry; PLACE_FAILED, when nothing is free.
+    """
+    target, others = found.target, found.others
+    try:
+        support = select(name, others)[0]
+    except OpenArmError as error:
+        text = f"no {name!r} to place {target.label!r} on or in; in view: {describe(others)}"
+        raise OpenArmError(error.code, text) from error
+    standing = [d for d in others if d is not support and distances_from(support, d.p_base[None, :2])[0] == 0.0]
+    floor = surface_of(support, found)
+    reach = 0.5 * float(max(target.size[:2]))
+    room = 0.5 * support.size[:2] - reach
+    if (room < -_OVERHANG).any():
+        raise OpenArmError(
+            Code.PLACE_FAILED,
+            f"{target.label!r} does not fit on {name!r}, which is {support.size[0] * 1e3:.0f} mm ×"
+            f" {support.size[1] * 1e3:.0f} mm large",
+        )
+    axes = [np.linspace(-r, r, 1 + 2 * int(r / _SPOT_STEP)) if r > 0.0 else np.zeros(1) for r in room]
+    flat = np.array(list(product(*axes))) @ support.T_base_object[:2, :2].T + support.p_base[:2]
+    free = np.min([np.full(len(flat), inf), *(distances_from(d, flat) for d in standing if d.top > floor)], axis=0)
+    away = np.linalg.norm(flat - support.p_base[:2], axis=1)
+    order = [i for i in np.lexsort((away, -np.minimum(free, _HAND_ROOM).round(3))) if free[i] >= reach + _NEXT]
+    if not order:
+        text = f"no free spot on {name!r}: {len(standing)} objects stand there, and {target.label!r} needs"
+        raise OpenArmError(Code.PLACE_FAILED, f"{text} {reach * 1e3:.0f} mm around its middle")
+    return tuple(np.array([*flat[i], floor]) for i in order[: 2 * config.spots])
 
 
 def grid(low: float, high: float, step: float) -> Array:

@@ -35,6 +35,7 @@ class GraspRequest:
         label: What to pick, in words; "" takes the first detection.
         arm: "auto", "left" or "right".
         place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
+        place_on: What it is to stand on or in, in words; "": the table.
         dry_run: Plan and report, do not move.
         confirm: Show each plan, and execute it when a person has confirmed it.
         phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds; "aside": push the
@@ -52,6 +53,7 @@ class GraspRequest:
     label: str
     arm: str = "auto"
     place: tuple[float, ...] | None = None
+    place_on: str = ""
     dry_run: bool = False
     confirm: bool = False
     phase: str = "all"

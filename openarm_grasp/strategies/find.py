@@ -31,7 +31,7 @@ from openarm_grasp.planning.arms import out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, little_turns, shorter
 from openarm_grasp.planning.neighbours import crowded, standing_boxes
 from openarm_grasp.planning.options import NO_WAY, NoWayError, not_placeable, options_of, planned
-from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets
+from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, spots_on
 from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import Grasp
@@ -195,6 +195,8 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
     request, target, table = run.request, sighting.target, run.context.table
     if request.place is not None:
         check_position(request.place, target, sighting.others, table)
+    if request.place_on:
+        spots_on(request.place_on, sighting, run.config.place)
     run.options, why = {}, ""
     arms = run.context.arm_order(request.arm, float(target.p_base[1]))
     arms = retries.arms_to_try(arms, run.failed)
@@ -291,7 +293,7 @@ async def _plan_with(
         # a hand that leans may find no way to a spot among other things
         among = grasp.of_cloud and bool(sighting.others) and request.phase == "all"
         shown = request.dry_run or (request.confirm and request.phase == "all")
-        if request.place is None and not (among or shown):
+        if request.place is None and not (request.place_on or among or shown):
             return grasp, found, chosen
         run.enter(State.PLAN, f"{chosen}; planning the place")
         try:
@@ -318,14 +320,17 @@ async def _plan_with(
 def grasp_of(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) -> Grasp:
     """A grasp with the ways to put the object down: where it was asked for, or on free spots."""
     request, target, others, table = run.request, sighting.target, sighting.others, run.context.table
-    if request.place is not None:
-        spots = (check_position(request.place, target, others, table),)
+    if request.place_on:
+        spots = spots_on(request.place_on, sighting, run.config.place)
+    elif request.place is not None:
+        spots = (run.context.on_table(check_position(request.place, target, others, table)),)
     else:
         # what a hand has kept because it could not be put down has to go somewhere
         every, shoulders = run.kept is not None, run.context.shoulders
-        spots = free_spots(arm, target, others, run.config, shoulders, request.place_choices, every=every)
+        flat = free_spots(arm, target, others, run.config, shoulders, request.place_choices, every=every)
+        spots = tuple(map(run.context.on_table, flat))
     places = place_targets(target, candidate, spots, run.config, run.used_places, yaw=request.place_yaw)
-    adjacent = tuple(d for d in others if d.measured and gap(d, target) < NEXT_TO)
+    adjacent = tuple(d for d in sighting.beside if d.measured and gap(d, target) < NEXT_TO)
     return Grasp(arm, sighting, candidate, places, adjacent=adjacent)
 
 
@@ -339,7 +344,7 @@ def regrasped(run: Run, grasp: Grasp, sighting: Sighting) -> Grasp:
     run.findings.sighting, run.place_plan = sighting, None
     before, now, merged = grasp.sighting, sighting.target, tuple[Detection, ...]()
     shift = float(np.linalg.norm((now.p_base - before.target.p_base)[:2]))
-    if shift > _ONE_MIDDLE and any(gap(d, now) < _AMONG for d in sighting.others):
+    if shift > _ONE_MIDDLE and any(gap(d, now) < _AMONG for d in sighting.beside):
         merged = tuple(d for d in before.others if d.measured and all(d is not one for one in sighting.others))
     return replace(grasp_of(run, grasp.arm, sighting, candidate), closed=grasp.closed, merged=merged)
 

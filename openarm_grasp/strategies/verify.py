@@ -20,7 +20,7 @@ from openarm_grasp.evidence.verdicts import CameraVerdict
 from openarm_grasp.perception.clouds import came_next_to, cluster_frames, cluster_of, nearest_to, stands
 from openarm_grasp.perception.detections import NEXT_TO, Frame
 from openarm_grasp.perception.sightings import object_points
-from openarm_grasp.planning.candidates import PlaceTarget
+from openarm_grasp.planning.candidates import UP, PlaceTarget
 from openarm_grasp.planning.place import placing_error
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import Grasp, Placed
@@ -91,7 +91,7 @@ def _judge_shape(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]
 
 
 def _was_next_to_others(grasp: Grasp) -> bool:
-    return any(gap(d, grasp.sighting.target) < NEXT_TO for d in grasp.sighting.others)
+    return any(gap(d, grasp.sighting.target) < NEXT_TO for d in grasp.sighting.beside)
 
 
 def _unproven(text: str, *, final: bool = False) -> CameraVerdict:
@@ -123,7 +123,9 @@ def _seen_whole(
     tolerance = _SEEN_WITHIN * config.place.tolerance
     # next to others it may have been several things, or have lain on one: such come apart, or fall
     leaned = _was_next_to_others(grasp)
-    rested = judge_rests(before, place, cluster_frames((frame,), place), tolerance, leaned=leaned)
+    rise = (place - grasp.sighting.target.foot) * UP
+    moved = replace(before, centroid=before.centroid + rise, top=before.top + float(rise[2]))
+    rested = judge_rests(moved, place, cluster_frames((frame,), place), tolerance, leaned=leaned)
     if not rested.ok:
         return rested
     # next to what was left behind the middle of both may be where that of one thing and the other should be
@@ -148,7 +150,7 @@ def _seen_in_part(
     if came_next_to(now, grasp.sighting.others, (frame,), NEXT_TO):
         text = "what is seen next to it was not there before: it may be a part of it, and its middle is not known"
         return _unproven(text)
-    if request.place is None and not request.place_choices:
+    if request.place is None and not (request.place_on or request.place_choices):
         run.place_target = replace(target, position=np.array([*now.p_base[:2], place[2]]))
         return seen
     middles = np.concatenate([now.p_base[None, :2], least_box_middles(points[:, :2])])

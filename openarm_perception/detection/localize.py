@@ -243,8 +243,8 @@ class Localizer:
         solid = self._on_object(patch) & (patch.points[..., 2] > patch.floor + self.config.table_margin)
         count = int(np.count_nonzero(solid))
         if count < self.config.min_points:
-            text = f" has {count} points above the surface under it at {patch.floor:.3f} m, expected at least"
-            text += f" {self.config.min_points}; is it flat, or is the table height wrong?"
+            text = f" has {count} points above the table (or what is under it) at {patch.floor:.3f} m, expected"
+            text += f" at least {self.config.min_points}; is it flat, or is the table height wrong?"
             raise _refusal(patch.found, Code.NOTHING_DETECTED, text)
         return solid
 
