@@ -134,20 +134,20 @@ def _to_push(scene: Scene) -> bool:
     def graspable(there: Detection) -> bool:
         grasps = propose(there, config, context.hand)
         return any(
-            _reaches(scene.table, arm, ways, there)
+            reaches(scene.table, arm, ways, there)
             for arm in robot.arm_names
             for ways in (grasps, tuple(shorter(one) for one in grasps))
         )
 
     def pushable(end: Array) -> bool:
         ways = {arm: push_ways(target, end, config, closed_hand(robot, arm), context.hand) for arm in robot.arm_names}
-        return any(_reaches(scene.table, arm, behind, target) for arm, behind in ways.items())
+        return any(reaches(scene.table, arm, behind, target) for arm, behind in ways.items())
 
     ends = [end for end in destinations(target, (), context) if end[0] < target.p_base[0]]
     return not graspable(target) and any(pushable(end) and graspable(standing_at(target, end)) for end in ends)
 
 
-def _reaches(table: Table, arm: str, ways: tuple[GraspCandidate, ...], target: Detection) -> bool:
+def reaches(table: Table, arm: str, ways: tuple[GraspCandidate, ...], target: Detection) -> bool:
     """Whether an arm at home finds a plan for an object that is known without an error."""
     solver = arms_behind((), table)[arm]
     try:
