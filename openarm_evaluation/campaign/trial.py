@@ -30,7 +30,7 @@ from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, watch_clearance
 from openarm_evaluation.judging.judge import RULES, judge, rests, rise_of
 from openarm_evaluation.judging.provenance import scene_hash
-from openarm_evaluation.judging.trial import Step, Trial, choose_targets
+from openarm_evaluation.judging.trial import Step, Trial, choose_targets, higher_by
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.requests.orders import Order
@@ -244,18 +244,10 @@ class Trials:
             name = min(lifted, key=lambda n: math.dist(robot.tracks[n][-1].p_world[:2], xy))
         if seen is not None and not outcome.attempts:  # nothing rose: that which was looked at
             name = min(names, key=lambda n: float(np.linalg.norm(robot.tracks[n][0].p_world - np.array(seen))))
-        item, table = task.scene.object(name), task.scene.table
-        floor = item.centre(table)[2] - 0.5 * item.size[2]
-        higher = self._floor() - floor
+        item = task.scene.object(name)
+        higher = higher_by(task.scene, item, task.place_on)
         verdict = judge(robot.tracks[name], xy, claimed=outcome.success, corners=item.corners, higher=higher)
         return Trial(task.scene, task.seed, name, outcome, verdict, steps, wall_s, end_ns)
-
-    def _floor(self) -> float:
-        """Height of what things are to stand on, m, by ground truth: the table, or the top of an object."""
-        if not self._task.place_on:
-            return self._task.scene.table.top_z
-        support = choose_targets(self._task.scene, self._task.place_on)[0]
-        return float(self.robot.tracks[support.name][-1].p_world[2] + 0.5 * support.size[2])
 
     def _rest(self, names: list[str]) -> None:
         end_ns = self.robot.t_ns + round(_REST_LIMIT_S * 1e9)

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.printable import LONGEST_TEXT, check_length
+from openarm_common.printable import LONGEST_TEXT, brief, check_length
 from openarm_common.types import Array
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 #: (x, y), base frame, m.
 Spot = tuple[float, float]
+#: What to pick, and what to put it on or in.
+_ON = re.compile(r"(.*?)\s*\b(?:on|in):\s*(\S.*)", re.DOTALL)
 #: What a request may ask for.
 PHASES = ("all", "pick", "place", "aside")
 
@@ -35,7 +38,6 @@ class GraspRequest:
         label: What to pick, in words; "" takes the first detection.
         arm: "auto", "left" or "right".
         place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
-        place_on: What it is to stand on or in, in words; "": the table.
         dry_run: Plan and report, do not move.
         confirm: Show each plan, and execute it when a person has confirmed it.
         phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds; "aside": push the
@@ -48,12 +50,12 @@ class GraspRequest:
         place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
         why: What it is for, when it is a part of another request.
         same: The object, when an earlier part of the request was about it: as it was seen or left then.
+        place_on: What it is to stand on or in, in words; "": the table.
     """
 
     label: str
     arm: str = "auto"
     place: tuple[float, ...] | None = None
-    place_on: str = ""
     dry_run: bool = False
     confirm: bool = False
     phase: str = "all"
@@ -65,6 +67,19 @@ class GraspRequest:
     place_choices: tuple[Spot, ...] = ()
     why: str = ""
     same: Sighting | None = None
+    place_on: str = ""
+
+    @classmethod
+    def of(cls, words: str, **fields: Any) -> GraspRequest:
+        """Return the request for words such as `red`, `red on:blue box` or `red in:tray`."""
+        found = _ON.fullmatch(words)
+        label, place_on = found.groups() if found else (words, "")
+        return cls(label, place_on=place_on, **fields)
+
+    @property
+    def words(self) -> str:
+        """What `of` reads: the label, and what to put it on."""
+        return f"{self.label} on:{self.place_on}" if self.place_on else self.label
 
     def about(self, same: Sighting) -> GraspRequest:
         """The request, for this object alone; it may have moved since."""
@@ -96,9 +111,12 @@ class GraspRequest:
         Raises:
             OpenArmError: INVALID_ARGUMENT.
         """
-        for name in ("label", "arm", "phase"):
+        for name in ("label", "arm", "phase", "place_on"):
             check_length(getattr(self, name), name)
         check_arm(self.arm, arms)
+        if self.place_on and self.place is not None:
+            text = f"two places: on:{self.place_on} and {brief(str(self.place))}; give one"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
         if self.phase not in PHASES:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"phase {self.phase!r} does not exist; valid: {', '.join(PHASES)}"
@@ -113,10 +131,11 @@ def command(requests: Sequence[GraspRequest]) -> str:
     """
     first = requests[0]
     words = ["openarm", "pick", *(request.label for request in requests if request.label)]
+    places = [(f"on:{one.place_on}",) if one.place_on else one.place and (*one.place, 0.0)[:3] for one in requests]
     options: dict[str, list[tuple[object, ...] | None]] = {
         "--arm": [None if first.arm == "auto" and len(requests) == 1 else (request.arm,) for request in requests],
         "--at": [request.object_at for request in requests],
-        "--place": [request.place and (*request.place, 0.0)[:3] for request in requests],
+        "--place": places,
         "--yaw": [None if request.place_yaw is None else (math.degrees(request.place_yaw),) for request in requests],
     }
     for name, values in options.items():

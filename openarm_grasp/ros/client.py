@@ -201,7 +201,7 @@ class GraspClient(BackgroundNode):
         goal = PickTwo.Goal(dry_run=dry_run, timeout=time_limit)
         for request, wanted in zip(goal.requests, (first, second), strict=True):
             asked = GraspRequest(wanted) if isinstance(wanted, str) else wanted
-            request.label, request.arm = asked.label, asked.arm
+            request.label, request.arm = asked.words, asked.arm
             _where(request, asked.place, asked.place_yaw, asked.object_at)
         answer: PickTwo.Result = self._ask(PickTwo, "/grasp/pick_two", goal, timeout, on_feedback)
         results = tuple(_result(one) for one in answer.results)

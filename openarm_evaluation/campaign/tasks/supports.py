@@ -19,6 +19,7 @@ from openarm_common.scene.scene import PALETTE, Scene, parse_scene, random_scene
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.tasks.two_arms import reaches
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.sightings import standing_at
 from openarm_grasp.planning.candidates import propose
 
@@ -58,7 +59,7 @@ def _drawn(rng: np.random.Generator, seed: int, kind: str) -> Scene | None:
         p = np.array(_top(parts[-1])) + se3.rot_z(parts[-1]["yaw"]) @ (*off, 0.5 * item["size"][2])
         item["position"] = [round(float(v), 4) for v in p]
     if kind == "box_to_box":
-        parts.append(_box(rng, -side, colors[1]))
+        parts.append(_box(rng, float(rng.choice((-1.0, 1.0))), colors[1]))
         standing.append(parts[-1])
     for a, b in combinations(standing, 2):
         radii = 0.5 * sum(math.hypot(*one["size"][:2]) for one in (a, b))
@@ -74,13 +75,14 @@ def _drawn(rng: np.random.Generator, seed: int, kind: str) -> Scene | None:
 
 
 def _in_reach(scene: Scene, places: list[list[float]]) -> bool:
-    """Whether one arm reaches the first object where it stands, and at all places (3,) of its footprint centre."""
+    """Whether an arm on the side of the first object reaches it, and all places (3,) of its footprint centre."""
     item, robot, config = scene.objects[0], RobotDescription.load(), GraspConfig()
     target = Detection(item.label, 1.0, item.T_world_object(scene.table), np.array(item.size), item.shape != "box")
     stands = (target, *(standing_at(target, place) for place in places))
-    hands = {arm: robot.hand(arm).parts for arm in robot.arm_names}
+    context = GraspContext.of(config, scene.table, robot)
     return any(
-        all(reaches(scene.table, arm, propose(one, config, hand), one) for one in stands) for arm, hand in hands.items()
+        all(reaches(scene.table, arm, propose(one, config, context.parts(arm)), one) for one in stands)
+        for arm in context.arm_order("auto", float(target.p_base[1]))
     )
 
 
