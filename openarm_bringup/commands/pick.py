@@ -8,14 +8,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from openarm_bringup.commands.connect import Domain, check_arms, join_graph, requires_node
 from openarm_bringup.outcome import Outcome, as_text, console
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.printable import brief
 
 if TYPE_CHECKING:
     from openarm_interfaces.msg import GraspStatus
@@ -34,7 +31,8 @@ def pick(
     *,
     arm: list[str] | None = None,
     at: list[tuple[float, float]] | None = None,
-    place: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    place: list[tuple[float, float, float]] | None = None,
+    place_on: list[str] | None = None,
     yaw: list[float] | None = None,
     phase: Literal["all", "pick", "place", "aside"] = "all",
     time_limit: float = 0.0,
@@ -56,8 +54,9 @@ def pick(
         second: Another object, picked in parallel.
         arm: Which arm: auto when not given.
         at: x y near the object, base frame, m: selects one of several alike.
-        place: Where to: x y z of the footprint centre, base frame, m (z is not read: the table); or on or in something
-            in view, as on:"blue box" or in:tray; chosen when not given. After the labels.
+        place: Where to: x y z of the footprint centre, base frame, m (z is not read: the table); chosen when not given.
+            Or on or in something in view: --place on:"blue box", --place in:tray.
+        place_on: What to place it on or in, as --place on:THING.
         yaw: Yaw of the object where it is put down, degrees about the vertical; unconstrained when not given.
         phase: pick ends with the object in the hand, place puts down what the hand holds; all does both. aside pushes
             the object away from where it is.
@@ -68,7 +67,8 @@ def pick(
     """
     labels = (label, second) if second else (label,)
     arms, spots = _each("arm", arm, labels), _each("at", at, labels)
-    places, yaws = _each("place", place and _places(place), labels), _each("yaw", yaw, labels)
+    places, yaws = _each("place", place, labels), _each("yaw", yaw, labels)
+    supports = _each("place-on", place_on, labels)
     if second and phase != "all":
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--phase {phase} is of one object; two are picked and placed")
     if second and confirm:
@@ -80,13 +80,13 @@ def pick(
 
     wanted: list[dict[str, Any]] = [
         {
-            "label": f"{name} {where}".strip() if isinstance(where, str) else name,
+            "label": name if on is None else f"{name} on:{on}",
             "arm": which or "auto",
-            "place": None if isinstance(where, str) else where,
+            "place": where,
             "place_yaw": None if turn is None else math.radians(turn),
             "object_at": spot,
         }
-        for name, which, where, turn, spot in zip(labels, arms, places, yaws, spots, strict=True)
+        for name, which, where, on, turn, spot in zip(labels, arms, places, supports, yaws, spots, strict=True)
     ]
     run: dict[str, Any] = {"dry_run": dry_run, "time_limit": time_limit, "timeout": timeout}
     run["on_feedback"] = _Steps(labels)
@@ -127,28 +127,6 @@ def _each(name: str, given: list[T] | None, labels: Sequence[str]) -> Sequence[T
             f"--{name} is given {len(given)} times, expected {len(labels)}: once for each of {of}",
         )
     return given
-
-
-def _places(words: Sequence[str]) -> list[tuple[float, ...] | str]:
-    """Return the places among the words of `--place`: three numbers, or one that begins with `on:` or `in:`.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, saying what was expected.
-    """
-    found, left = list[tuple[float, ...] | str](), list(words)
-    while left:
-        if left[0].startswith(("on:", "in:")) and left[0][3:].strip():
-            found.append(left.pop(0))
-            continue
-        try:
-            found.append(tuple(float(word) for word in left[:3]))
-        except ValueError:
-            found.append(())
-        if len(found[-1]) != 3:
-            text = f"--place {brief(' '.join(left))}: expected x y z in metres, or on:THING or in:THING as one word"
-            raise OpenArmError(Code.INVALID_ARGUMENT, f'{text}, such as on:"blue box"; labels come before --place')
-        del left[:3]
-    return found
 
 
 def _runs(plan: GraspStatus) -> bool:

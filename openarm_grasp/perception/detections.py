@@ -406,12 +406,12 @@ def on_table(d: Detection, table_z: float, *, reach: float = 0.01) -> Detection:
     Args:
         d: The box.
         table_z: Height of the table top, base frame, m.
-        reach: A bottom further than this from the table is believed (the object stands on something else), m.
+        reach: A bottom so much higher than the table is believed (the object stands on something else), m.
 
     Raises:
         OpenArmError: STALE_DATA, when the box is flatter than 5 mm: there is nothing to grasp.
     """
-    if abs(d.bottom - table_z) > reach:
+    if d.bottom - table_z > reach:
         return d
     height = d.top - table_z
     if height < 0.005:

@@ -15,11 +15,13 @@ from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array, Floats
 from openarm_grasp.perception.detections import Sighting
 
+#: Edge of a column of points, m.
+COLUMN = 0.005
 #: Points so far out of the box of a thing are its own, m.
 _OUT = 0.004
 #: What is this near to the edges of something, or to what stands there, says nothing of its surface, m; nor do fewer
-#: points.
-_RIM, _FEW = 0.012, 30
+#: columns.
+_RIM, _FEW = 0.012, 20
 
 
 def object_points(clouds: Sequence[LabelledCloud]) -> Array:
@@ -39,6 +41,16 @@ def in_box(points: Array | Floats, one: Detection) -> NDArray[np.bool_]:
     return np.asarray((np.abs(local) <= 0.5 * one.size + _OUT).all(axis=1), dtype=np.bool_)
 
 
+def tops(points: Array) -> Array:
+    """Highest point (n, 3) of each column of points, at its middle."""
+    cells = np.floor(points[:, :2] / COLUMN).astype(np.int64)
+    order = np.lexsort((cells[:, 1], cells[:, 0]))
+    cells = cells[order]
+    first = np.flatnonzero(np.diff(cells, axis=0, prepend=cells[:1] - 1).any(axis=1))
+    high = np.maximum.reduceat(points[order, 2], first)
+    return np.column_stack([(cells[first] + 0.5) * COLUMN, high]).astype(np.float64)
+
+
 def surface_of(one: Detection, found: Sighting) -> float:
     """Height at which things stand on something, or in it, m: of most of its points, without its rim and what is there.
 
@@ -47,8 +59,9 @@ def surface_of(one: Detection, found: Sighting) -> float:
         found: What was seen; without points, its top.
     """
     points = points_around(found.clouds[-1:])
+    points = tops(points[in_box(points, one)])
     local = (points - one.p_base) @ one.T_base_object[:3, :3]
-    own = (np.abs(local[:, :2]) <= 0.5 * one.size[:2] - _RIM).all(axis=1) & (points[:, 2] <= one.top + _OUT)
+    own = (np.abs(local[:, :2]) <= 0.5 * one.size[:2] - _RIM).all(axis=1)
     for other in found.others:
         if other is not one and other.bottom >= one.bottom + _OUT:
             own &= distances_from(other, points[:, :2]) > _RIM

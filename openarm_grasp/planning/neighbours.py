@@ -18,7 +18,7 @@ from openarm_common.detection import gap
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.perception.sightings import in_box, object_points, points_around, surface_of
+from openarm_grasp.perception.sightings import COLUMN, in_box, object_points, points_around, surface_of, tops
 from openarm_grasp.planning.candidates import UP, Box, PlaceTarget, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
 
@@ -26,8 +26,6 @@ from openarm_grasp.sampling.slabs import slabs
 _FULL = 0.8
 #: What stands this near to an object may keep a hand from it, m.
 _CLOSE = 0.04
-#: Edge of a column of points, m.
-_STEP = 0.005
 #: A plan keeps so far from obstacles, and what is lifted touches none of them at first, m.
 _APART = 0.005
 #: Boxes about a thing, and the share of its volume that a further one must save.
@@ -59,7 +57,7 @@ def cornered(found: Sighting) -> bool:
         hull = ConvexHull(cells[:, :2]).volume
     except QhullError:
         return False  # all on one line
-    return len(cells) * _STEP**2 < _FULL * hull
+    return len(cells) * COLUMN**2 < _FULL * hull
 
 
 def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tuple[Box, ...]:
@@ -79,8 +77,8 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
         if len(own) < _LEAST_POINTS:
             made = (whole,)
         else:
-            made = slabs(one.label, columns(own, one.bottom), _STEP, most=_MOST, saved=_SAVED)
-            made = tuple(replace(box, size=np.maximum(box.size - 2.0 * _NEARER, _STEP)) for box in made)
+            made = slabs(one.label, columns(own, one.bottom), COLUMN, most=_MOST, saved=_SAVED)
+            made = tuple(replace(box, size=np.maximum(box.size - 2.0 * _NEARER, COLUMN)) for box in made)
         parts += [replace(box, id=f"{whole.id}/{n}" if len(made) > 1 else whole.id) for n, box in enumerate(made)]
     for box in held:
         parts = [cut for part in parts if (cut := _beside(part, box)) is not None]
@@ -100,27 +98,17 @@ def under(parts: Sequence[Box], places: Sequence[PlaceTarget]) -> tuple[Box, ...
     return tuple(found)
 
 
-def tops(points: Array) -> Array:
-    """Highest point (n, 3) of each column of points, at its middle."""
-    cells = np.floor(points[:, :2] / _STEP).astype(np.int64)
-    order = np.lexsort((cells[:, 1], cells[:, 0]))
-    cells = cells[order]
-    first = np.flatnonzero(np.diff(cells, axis=0, prepend=cells[:1] - 1).any(axis=1))
-    high = np.maximum.reduceat(points[order, 2], first)
-    return np.column_stack([(cells[first] + 0.5) * _STEP, high]).astype(np.float64)
-
-
 def standing_boxes(label: str, points: Array, floor: float, table_gap: float) -> tuple[Box, ...]:
     """Boxes about what reaches from its highest points (n, 3) down to a height, and a gap above that, m."""
-    return slabs(label, columns(points, floor), _STEP, gap=table_gap)
+    return slabs(label, columns(points, floor), COLUMN, gap=table_gap)
 
 
 def columns(points: Array, floor: float) -> Array:
     """Middles of voxels (n, 3) from the highest point of each column down to a height."""
     high = tops(points)
-    many = np.maximum(np.ceil((high[:, 2] - floor) / _STEP), 1.0).astype(np.int64)
+    many = np.maximum(np.ceil((high[:, 2] - floor) / COLUMN), 1.0).astype(np.int64)
     level = np.arange(int(many.sum())) - np.repeat(np.cumsum(many) - many, many)
-    return np.column_stack([np.repeat(high[:, :2], many, axis=0), floor + (level + 0.5) * _STEP]).astype(np.float64)
+    return np.column_stack([np.repeat(high[:, :2], many, axis=0), floor + (level + 0.5) * COLUMN]).astype(np.float64)
 
 
 def _beside(part: Box, held: Box) -> Box | None:
@@ -131,7 +119,7 @@ def _beside(part: Box, held: Box) -> Box | None:
     share = np.concatenate([above, below]) / np.tile(part.size, 2)
     best = int(share.argmin())
     lost = float(np.concatenate([above, below])[best])
-    if share[best] >= 1.0 or part.size[best % 3] - lost < _STEP / 2.0:
+    if share[best] >= 1.0 or part.size[best % 3] - lost < COLUMN / 2.0:
         return None
     return _cut(part, best % 3, lost, top=best < 3)
 
@@ -147,7 +135,7 @@ def _not_over(part: Box, held: Box, lift: float) -> Box | None:
     if lost[best] > _OVER + _APART:
         return part
     axis = best % 2
-    return _cut(part, axis, float(lost[best]), top=best < 2) if part.size[axis] - lost[best] >= _STEP / 2.0 else None
+    return _cut(part, axis, float(lost[best]), top=best < 2) if part.size[axis] - lost[best] >= COLUMN / 2.0 else None
 
 
 def _overlap(part: Box, held: Box) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ from itertools import product
 from math import hypot, inf
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from openarm_common import se3
 from openarm_common.detection import Detection, distances_from
@@ -29,6 +30,8 @@ from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, h
 
 #: Spots nearer to each other than this are one, m.
 SAME_SPOT = 0.02
+#: A point of the table that is in view is this near to a spot that nothing hides, m.
+_SEEN = 0.03
 #: An object may be so much wider than what it is placed on, on each side, m.
 _OVERHANG = 0.01
 #: Grid of spots there, their distance from what stands there, and room around that is enough for a hand, m.
@@ -160,6 +163,7 @@ def free_spots(
     shoulders: Shoulders,
     choices: Sequence[Sequence[float]] = (),
     *,
+    seen: Array | None = None,
     every: bool = False,
 ) -> tuple[Array, ...]:
     """Free spots, best first: of those that may be chosen, or anywhere on the arm's side of the table.
@@ -175,6 +179,7 @@ def free_spots(
         config: Parameters.
         shoulders: Of the arms.
         choices: (x, y) of spots, base frame, m; none: a grid on the arm's side.
+        seen: (n, 3) points of the table that are in view: spots that nothing hides come first; None: all are.
         every: As many as there are, not only `config.place.spots`.
 
     Raises:
@@ -194,9 +199,10 @@ def free_spots(
         )
     xy = np.array([spot[2:] for spot in clear])
     room = np.min([np.full(len(xy), inf), *(distances_from(d, xy) for d in others)], axis=0)
+    hidden = np.zeros(len(xy)) if seen is None or not len(seen) else KDTree(seen[:, :2]).query(xy)[0]
     ranked = [
-        (bool(free < reach), clearance < place.neighbour_room, cost, x, y)
-        for free, (cost, clearance, x, y) in zip(room, clear, strict=True)
+        (bool(free < reach), dark > _SEEN, clearance < place.neighbour_room, cost, x, y)
+        for free, dark, (cost, clearance, x, y) in zip(room, hidden, clear, strict=True)
     ]
     # Six spots side by side would share one fate, so those offered lie apart.
     chosen: list[Array] = []

@@ -131,11 +131,11 @@ def command(requests: Sequence[GraspRequest]) -> str:
     """
     first = requests[0]
     words = ["openarm", "pick", *(request.label for request in requests if request.label)]
-    places = [(f"on:{one.place_on}",) if one.place_on else one.place and (*one.place, 0.0)[:3] for one in requests]
     options: dict[str, list[tuple[object, ...] | None]] = {
         "--arm": [None if first.arm == "auto" and len(requests) == 1 else (request.arm,) for request in requests],
         "--at": [request.object_at for request in requests],
-        "--place": places,
+        "--place": [request.place and (*request.place, 0.0)[:3] for request in requests],
+        "--place-on": [(request.place_on,) if request.place_on else None for request in requests],
         "--yaw": [None if request.place_yaw is None else (math.degrees(request.place_yaw),) for request in requests],
     }
     for name, values in options.items():

@@ -48,6 +48,8 @@ _SHORTEST = 0.35
 _FAR_FROM_WEIGHT = 0.8
 #: The middle of two things is that of the one where it is no farther off, m; things so near to them are a heap, m.
 _ONE_MIDDLE, _AMONG = 0.01, 0.15
+#: What is seen this near to the height of the table is table, m.
+_TABLE = 0.015
 #: An object that is observed so may be trusted in the next frames.
 _NOT_TRUSTED = (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT, Code.STALE_DATA)
 
@@ -327,7 +329,10 @@ def grasp_of(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) 
     else:
         # what a hand has kept because it could not be put down has to go somewhere
         every, shoulders = run.kept is not None, run.context.shoulders
-        flat = free_spots(arm, target, others, run.config, shoulders, request.place_choices, every=every)
+        seen = [cloud.points[np.abs(cloud.points[:, 2] - table.top_z) < _TABLE] for cloud in sighting.clouds[-1:]]
+        flat = free_spots(
+            arm, target, others, run.config, shoulders, request.place_choices, seen=next(iter(seen), None), every=every
+        )
         spots = tuple(map(run.context.on_table, flat))
     places = place_targets(target, candidate, spots, run.config, run.used_places, yaw=request.place_yaw)
     adjacent = tuple(d for d in sighting.beside if d.measured and gap(d, target) < NEXT_TO)

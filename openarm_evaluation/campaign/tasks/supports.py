@@ -28,7 +28,7 @@ KINDS = ("from_box", "on_box", "box_to_box", "from_shelf", "on_shelf")
 #: Heights of tops over the table, edges of boxes and of boards, thickness of these and of the walls below them, m.
 _HEIGHT, _EDGE, _BOARD, _THICK = (0.05, 0.25), (0.12, 0.18), ((0.18, 0.22), (0.24, 0.30)), 0.02
 #: Mass of a part of a support, kg; between things that stand side by side, m.
-_MASS, _APART = 1.5, 0.04
+_MASS, _APART = 1.5, 0.08
 #: Most |y| of a support, m: what stands on it is in view of the camera over the table.
 _ASIDE = 0.30
 
