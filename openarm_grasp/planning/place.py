@@ -19,7 +19,7 @@ from openarm_common import se3
 from openarm_common.detection import Detection, distances_from
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.work import Table
-from openarm_common.types import Array
+from openarm_common.types import Array, Floats
 from openarm_common.wanted import describe, select
 from openarm_grasp.config import GraspConfig, PlaceConfig
 from openarm_grasp.evidence.verdicts import SQUARE_WITHIN
@@ -163,7 +163,7 @@ def free_spots(
     shoulders: Shoulders,
     choices: Sequence[Sequence[float]] = (),
     *,
-    seen: Array | None = None,
+    seen: Array | Floats | None = None,
     every: bool = False,
 ) -> tuple[Array, ...]:
     """Free spots, best first: of those that may be chosen, or anywhere on the arm's side of the table.
