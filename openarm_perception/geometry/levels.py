@@ -62,7 +62,7 @@ class Levels:
         return out
 
     def carry(self, label: NDArray[np.integer], pairs: NDArray[np.integer]) -> Mask:
-        """Return which pairs (n, 2) of labels of an image (h, w) are of a surface and of what stands on it."""
+        """Return of which pairs (n, 2) of labels of an image (h, w) the first carries the second."""
         n, size = len(self.height), int(label.max()) + 1
         face, under = (
             np.bincount(label.ravel() * np.int64(n) + numbers.ravel(), minlength=size * n).reshape(size, n)
@@ -71,7 +71,7 @@ class Levels:
         face[:, 0] = 0
         shown = np.where(face.any(axis=1), face.argmax(axis=1), -1)
         a, b = np.asarray(pairs).T
-        return (shown[a] == under.argmax(axis=1)[b]) | (shown[b] == under.argmax(axis=1)[a])
+        return np.asarray(shown[a] == under.argmax(axis=1)[b])
 
 
 def find_levels(points: Array | NDArray[np.float32], apart: Mask, least: float) -> Levels:

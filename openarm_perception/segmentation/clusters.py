@@ -169,9 +169,12 @@ class _Image:
 
 
 def _carried(levels: Levels, label: NDArray[np.uint16], count: int) -> NDArray[np.bool_]:
-    """Return which of the things (n, n) carry each other."""
+    """Return which of the things (n, n) carry each other, also by what stands between them."""
     pairs = np.indices((count, count)).reshape(2, -1).T + 1
-    return levels.carry(label, pairs).reshape(count, count)
+    found = levels.carry(label, pairs).reshape(count, count)
+    for _ in levels.height:
+        found |= found @ found
+    return found | found.T
 
 
 def _window(label: NDArray[np.uint16], i: int) -> tuple[slice, slice]:

@@ -146,7 +146,7 @@ def divide(
     # metres across of a pixel at a patch, squared
     area = moments[:, 0] * (pixel * moments[:, 3] / np.maximum(moments[:, 0], 1.0)) ** 2
     border = borders(patch, broken, points)
-    border = border[~levels.carry(patch, border[:, :2])]
+    border = border[~(levels.carry(patch, border[:, :2]) | levels.carry(patch, border[:, 1::-1]))]
     root, _ = partition(moments, border, support.noise)
     root = _join_small(root, patch, area, moments[:, 0], border, size, config)
     if rgb is not None and config.join_colors:

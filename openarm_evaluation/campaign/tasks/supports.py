@@ -44,7 +44,7 @@ def supports_task(seed: int) -> Task:
 
 def _drawn(rng: np.random.Generator, seed: int, kind: str) -> Scene | None:
     """Draw a scene, the object first and what it goes to last; None where it does not fit."""
-    item, other = (one.model_dump() for one in random_scene(seed, count=2).objects)
+    item, other = (one.model_dump() for one in random_scene(int(rng.integers(1 << 31)), count=2).objects)
     colors = [str(color) for color in rng.permutation(list(PALETTE)) if color not in (item["color"], other["color"])]
     side, raised = float(rng.choice((-1.0, 1.0))), not kind.startswith("on")
     if kind.endswith("shelf"):
