@@ -21,7 +21,7 @@ COLUMN = 0.005
 _OUT = 0.004
 #: What is this near to the edges of something, or to what stands there, says nothing of its surface, m; nor do fewer
 #: columns.
-_RIM, _FEW = 0.012, 20
+RIM, _FEW = 0.012, 20
 
 
 def object_points(clouds: Sequence[LabelledCloud]) -> Array:
@@ -61,10 +61,10 @@ def surface_of(one: Detection, found: Sighting) -> float:
     points = points_around(found.clouds[-1:])
     points = tops(points[in_box(points, one)])
     local = (points - one.p_base) @ one.T_base_object[:3, :3]
-    own = (np.abs(local[:, :2]) <= 0.5 * one.size[:2] - _RIM).all(axis=1)
+    own = (np.abs(local[:, :2]) <= 0.5 * one.size[:2] - RIM).all(axis=1)
     for other in found.others:
         if other is not one and other.bottom >= one.bottom + _OUT:
-            own &= distances_from(other, points[:, :2]) > _RIM
+            own &= distances_from(other, points[:, :2]) > RIM
     return float(np.median(points[own, 2])) if np.count_nonzero(own) >= _FEW else one.top
 
 

@@ -18,7 +18,7 @@ from openarm_common.detection import gap
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.perception.sightings import COLUMN, in_box, object_points, points_around, surface_of, tops
+from openarm_grasp.perception.sightings import COLUMN, RIM, in_box, object_points, points_around, surface_of, tops
 from openarm_grasp.planning.candidates import UP, Box, PlaceTarget, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
 
@@ -72,10 +72,11 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     seen, parts = points_around(found.clouds), list[Box]()
     for one in found.others:
         whole = boxes[id(one)]
-        solid = one.kind and one.measured and surface_of(one, found) >= one.top - _HOLLOW
-        own = seen[:0] if solid else seen[in_box(seen, one)]
+        prism = one.kind and one.measured
+        own = seen[:0] if prism else seen[in_box(seen, one)]
         if len(own) < _LEAST_POINTS:
-            made = (whole,)
+            deep = one.top - surface_of(one, found) if prism else 0.0
+            made = (whole,) if deep < _HOLLOW else _walled(whole, deep + config.approach.obstacle_margin)
         else:
             made = slabs(one.label, columns(own, one.bottom), COLUMN, most=_MOST, saved=_SAVED)
             made = tuple(replace(box, size=np.maximum(box.size - 2.0 * _NEARER, COLUMN)) for box in made)
@@ -85,6 +86,19 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     for box in held:
         parts = [cut for part in parts if (cut := _not_over(part, box, config.approach.lift_height)) is not None]
     return tuple(parts)
+
+
+def _walled(whole: Box, deep: float) -> tuple[Box, ...]:
+    """A box that is hollow from above, to a depth, as its bottom and four walls."""
+    (x, y, z), wall = whole.size, RIM + _APART
+    sizes = [(x, y, z - deep), *[(wall, y, deep)] * 2, *[(x, wall, deep)] * 2]
+    shifts = [(0.0, 0.0, -0.5 * deep)]
+    shifts += [(sign * 0.5 * (x - wall), 0.0, 0.5 * (z - deep)) for sign in (1.0, -1.0)]
+    shifts += [(0.0, sign * 0.5 * (y - wall), 0.5 * (z - deep)) for sign in (1.0, -1.0)]
+    return tuple(
+        replace(whole, T_frame_box=whole.T_frame_box @ se3.make(p=shift), size=np.array(size))
+        for shift, size in zip(shifts, sizes, strict=True)
+    )
 
 
 def under(parts: Sequence[Box], places: Sequence[PlaceTarget]) -> tuple[Box, ...]:
