@@ -42,7 +42,7 @@ _CLOUDS = 3
 _PIECE = 0.010
 #: A point of an object is there in another frame with one as near to it, m; this share of all of them must be.
 _SAME_POINT, _MOST = 0.005, 0.95
-#: What stands on another thing begins this far below the top of that at most, m.
+#: What stands on another thing, or in it, begins so much higher than that, m.
 _STACKED = 0.005
 #: An object of fewer points has no cloud.
 _LEAST_POINTS = 60
@@ -128,8 +128,9 @@ def apart(a: Detection, b: Detection) -> float:
 
 
 def stacked(a: Detection, b: Detection) -> bool:
-    """Whether one of two objects ends about where the other begins, or lower."""
-    return min(a.top, b.top) <= max(a.bottom, b.bottom) + _STACKED
+    """Whether one of two objects stands on the other, or in it."""
+    lower, upper = sorted((a, b), key=lambda d: d.bottom)
+    return upper.bottom - lower.bottom > _STACKED and not distances_from(lower, upper.p_base[None, :2]).any()
 
 
 def sticks_out(seen: Detection, stood: Detection) -> float:

@@ -22,6 +22,8 @@ _OUT = 0.004
 #: What is this near to the edges of something, or to what stands there, says nothing of its surface, m; nor do fewer
 #: columns.
 RIM, _FEW = 0.012, 20
+#: It is level where no more than this share of it is so much higher or lower, m.
+_LEVEL, _UNEVEN = 0.008, 0.25
 
 
 def object_points(clouds: Sequence[LabelledCloud]) -> Array:
@@ -52,7 +54,7 @@ def tops(points: Array) -> Array:
 
 
 def surface_of(one: Detection, found: Sighting) -> float:
-    """Height at which things stand on something, or in it, m: of most of its points, without its rim and what is there.
+    """Height at which things stand on something, or in it, m: where it is level within its rim, else its top.
 
     Args:
         one: It; of `found.others`.
@@ -65,7 +67,10 @@ def surface_of(one: Detection, found: Sighting) -> float:
     for other in found.others:
         if other is not one and other.bottom >= one.bottom + _OUT:
             own &= distances_from(other, points[:, :2]) > RIM
-    return float(np.median(points[own, 2])) if np.count_nonzero(own) >= _FEW else one.top
+    if np.count_nonzero(own) < _FEW:
+        return one.top
+    floor = float(np.median(points[own, 2]))
+    return floor if np.mean(np.abs(points[own, 2] - floor) > _LEVEL) <= _UNEVEN else one.top
 
 
 def joined(found: Sighting, parts: Sequence[Detection]) -> Sighting:

@@ -35,7 +35,7 @@ _MOST, _SAVED = 20, 0.02
 _NEARER = 0.003
 #: What reaches over an object by no more than this slides off it when it is lifted, m.
 _OVER = 0.015
-#: A prism that is seen to be so much lower within its rim is hollow, m.
+#: What is level within its rim, and so much lower there, is hollow, m.
 _HOLLOW = 0.01
 #: What is put down on something is this near to the top of a box about that, m, which is taken so much lower.
 _FACE, _LOWER = 0.012, 0.002
@@ -72,11 +72,11 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     seen, parts = points_around(found.clouds), list[Box]()
     for one in found.others:
         whole = boxes[id(one)]
-        prism = one.kind and one.measured
-        own = seen[:0] if prism else seen[in_box(seen, one)]
-        if len(own) < _LEAST_POINTS:
-            deep = one.top - surface_of(one, found) if prism else 0.0
-            made = (whole,) if deep < _HOLLOW else _walled(whole, deep + config.approach.obstacle_margin)
+        own = seen[in_box(seen, one)] if not (one.kind and one.measured) else seen[:0]
+        if (deep := one.top - surface_of(one, found)) >= _HOLLOW:
+            made = _walled(whole, deep + config.approach.obstacle_margin)
+        elif len(own) < _LEAST_POINTS:
+            made = (whole,)
         else:
             made = slabs(one.label, columns(own, one.bottom), COLUMN, most=_MOST, saved=_SAVED)
             made = tuple(replace(box, size=np.maximum(box.size - 2.0 * _NEARER, COLUMN)) for box in made)

@@ -30,6 +30,8 @@ from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, h
 
 #: Spots nearer to each other than this are one, m.
 SAME_SPOT = 0.02
+#: What reaches farther from its middle is large, m: distances to it are those to its outline, and so much.
+_LARGE = 0.05
 #: A point of the table that is in view is this near to a spot that nothing hides, m.
 _SEEN = 0.03
 #: An object may be so much wider than what it is placed on, on each side, m.
@@ -231,10 +233,13 @@ def clear_spots(
         from, less the clearance up to twice the distance asked for.
     """
     found: list[tuple[float, float, float, float]] = []
-    for spot in spots:
-        x, y = float(spot[0]), float(spot[1])
+    xys = np.array([[float(spot[0]), float(spot[1])] for spot in spots])
+    outlines = [distances_from(d, xys) + _LARGE for d in others]  # of what is large the middle may be far
+    edges = np.min([np.full(len(xys), inf), *outlines], axis=0)
+    for (x, y), edge in zip(xys.tolist(), edges.tolist(), strict=True):
         origin = hypot(x - target.p_base[0], y - target.p_base[1])
         clearance = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
+        clearance = min(clearance, edge)
         if origin >= config.origin_distance and clearance >= config.neighbour_distance:
             found.append((origin - min(clearance, 2.0 * config.neighbour_distance), clearance, x, y))
     return found

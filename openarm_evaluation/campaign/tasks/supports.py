@@ -20,8 +20,9 @@ from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.tasks.two_arms import reaches
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.sightings import standing_at
-from openarm_grasp.planning.candidates import propose
+from openarm_grasp.planning.candidates import held_boxes, propose, target_box
+from openarm_grasp.planning.place import place_targets
+from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
 
 #: What is asked for, in turn.
 KINDS = ("from_box", "on_box", "box_to_box", "from_shelf", "on_shelf")
@@ -31,6 +32,8 @@ _HEIGHT, _EDGE, _BOARD, _THICK = (0.05, 0.25), (0.12, 0.18), ((0.18, 0.22), (0.2
 _MASS, _APART = 1.5, 0.08
 #: Most |y| of a support, m: what stands on it is in view of the camera over the table.
 _ASIDE = 0.30
+#: Grasps of an object that are looked at, best first.
+_GRASPS = 4
 
 
 def supports_task(seed: int) -> Task:
@@ -75,15 +78,18 @@ def _drawn(rng: np.random.Generator, seed: int, kind: str) -> Scene | None:
 
 
 def _in_reach(scene: Scene, places: list[list[float]]) -> bool:
-    """Whether an arm on the side of the first object reaches it, and all places (3,) of its footprint centre."""
-    item, robot, config = scene.objects[0], RobotDescription.load(), GraspConfig()
+    """Whether an arm on the side of the first object can grasp it so that it reaches the place (3,), if any."""
+    item, config = scene.objects[0], GraspConfig()
     target = Detection(item.label, 1.0, item.T_world_object(scene.table), np.array(item.size), item.shape != "box")
-    stands = (target, *(standing_at(target, place) for place in places))
-    context = GraspContext.of(config, scene.table, robot)
-    return any(
-        all(reaches(scene.table, arm, propose(one, config, context.parts(arm)), one) for one in stands)
-        for arm in context.arm_order("auto", float(target.p_base[1]))
-    )
+    context = GraspContext.of(config, scene.table, RobotDescription.load())
+    for arm in context.arm_order("auto", float(target.p_base[1])):
+        for grasp in propose(target, config, context.parts(arm))[:_GRASPS]:
+            held = held_boxes(target, grasp, config)
+            ways = (PlanPlace(arm, place_targets(target, grasp, [np.array(p)], config), (), held) for p in places)
+            take = PlanGrasp(arm, (grasp,), (), (target_box(target, config),))
+            if reaches(scene.table, take) and all(reaches(scene.table, way) for way in ways):
+                return True
+    return False
 
 
 def _box(rng: np.random.Generator, side: float, color: str) -> dict[str, Any]:
