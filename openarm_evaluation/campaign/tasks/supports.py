@@ -40,7 +40,7 @@ def supports_task(seed: int) -> Task:
     """Make a task with an object, the supports that it comes from and goes to, and another object on the table."""
     rng, kind = np.random.default_rng([seed, 47]), KINDS[seed % len(KINDS)]
     what = f"supports {seed}: things side by side that an arm reaches where they stand and where they go"
-    scene = first_fit(what, "enlarge work.region of robot.yaml", lambda: _drawn(rng, seed, kind))
+    scene = first_fit(what, "enlarge work.region of robot.yaml", lambda: _drawn(rng, seed, kind), 4000)
     place_on = "" if kind.startswith("from") else scene.objects[-1].label
     return Task("supports", seed, scene, (scene.objects[0].label,), kind=kind, place_on=place_on)
 
@@ -62,7 +62,7 @@ def _drawn(rng: np.random.Generator, seed: int, kind: str) -> Scene | None:
         p = np.array(_top(parts[-1])) + se3.rot_z(parts[-1]["yaw"]) @ (*off, 0.5 * item["size"][2])
         item["position"] = [round(float(v), 4) for v in p]
     if kind == "box_to_box":
-        parts.append(_box(rng, float(rng.choice((-1.0, 1.0))), colors[1]))
+        parts.append(_box(rng, side, colors[1], nearest=-_ASIDE / 4.0))
         standing.append(parts[-1])
     for a, b in combinations(standing, 2):
         radii = 0.5 * sum(math.hypot(*one["size"][:2]) for one in (a, b))
@@ -92,11 +92,11 @@ def _in_reach(scene: Scene, places: list[list[float]]) -> bool:
     return False
 
 
-def _box(rng: np.random.Generator, side: float, color: str) -> dict[str, Any]:
-    """Draw a box to stand on, on one side of the table."""
+def _box(rng: np.random.Generator, side: float, color: str, nearest: float | None = None) -> dict[str, Any]:
+    """Draw a box to stand on, on one side of the table; `nearest` to its middle, m, may be beyond that."""
     size = (float(rng.uniform(*_EDGE)), float(rng.uniform(*_EDGE)), float(rng.uniform(*_HEIGHT)))
     yaw = float(rng.uniform(-math.pi, math.pi))
-    return _part(f"{color}_support", color, size, (*_spot(rng, side), 0.5 * size[2]), yaw)
+    return _part(f"{color}_support", color, size, (*_spot(rng, side, nearest), 0.5 * size[2]), yaw)
 
 
 def _shelf(rng: np.random.Generator, side: float, color: str) -> list[dict[str, Any]]:
@@ -110,9 +110,10 @@ def _shelf(rng: np.random.Generator, side: float, color: str) -> list[dict[str, 
     return [*parts, _part("shelf", color, (deep, wide, _THICK), (x, y, height - 0.5 * _THICK), yaw)]
 
 
-def _spot(rng: np.random.Generator, side: float) -> tuple[float, float]:
+def _spot(rng: np.random.Generator, side: float, nearest: float | None = None) -> tuple[float, float]:
     region = robot_work().region
-    return float(rng.uniform(*region.x)), side * float(rng.uniform(region.abs_y[0], min(region.abs_y[1], _ASIDE)))
+    nearest = region.abs_y[0] if nearest is None else nearest
+    return float(rng.uniform(*region.x)), side * float(rng.uniform(nearest, min(region.abs_y[1], _ASIDE)))
 
 
 def _part(name: str, color: str, size: tuple[float, ...], p: tuple[float, ...], yaw: float) -> dict[str, Any]:
