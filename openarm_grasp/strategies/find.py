@@ -292,8 +292,9 @@ async def _plan_with(
         # Also without a place that is asked for: no free spot is a reason not to lift.
         grasp = run.grasp = grasp_of(run, arm, sighting, candidate)
         chosen = f"grasp {candidate.id} with the {arm} arm"
-        # a hand that leans may find no way to a spot among other things
-        among = grasp.of_cloud and bool(sighting.others) and request.phase == "all"
+        # a hand that leans may find no way to a spot among other things, nor one that passes what it has cleared
+        raised = sighting.target.bottom > run.context.table.top_z + _TABLE
+        among = (grasp.of_cloud or raised) and bool(sighting.others) and request.phase == "all"
         shown = request.dry_run or (request.confirm and request.phase == "all")
         if request.place is None and not (request.place_on or among or shown):
             return grasp, found, chosen
