@@ -32,6 +32,8 @@ _HEIGHT, _EDGE, _BOARD, _THICK = (0.05, 0.25), (0.12, 0.18), ((0.18, 0.22), (0.2
 _MASS, _APART = 1.5, 0.08
 #: Most |y| of a support, m: what stands on it is in view of the camera over the table.
 _ASIDE = 0.30
+#: Room for a hand at a place on the table, m.
+_HAND = 0.08
 #: Grasps of an object that are looked at, best first.
 _GRASPS = 4
 
@@ -40,13 +42,15 @@ def supports_task(seed: int) -> Task:
     """Make a task with an object, the supports that it comes from and goes to, and another object on the table."""
     rng, kind = np.random.default_rng([seed, 47]), KINDS[seed % len(KINDS)]
     what = f"supports {seed}: things side by side that an arm reaches where they stand and where they go"
-    scene = first_fit(what, "enlarge work.region of robot.yaml", lambda: _drawn(rng, seed, kind), 4000)
-    place_on = "" if kind.startswith("from") else scene.objects[-1].label
-    return Task("supports", seed, scene, (scene.objects[0].label,), kind=kind, place_on=place_on)
+    scene, (x, y, _) = first_fit(what, "enlarge work.region of robot.yaml", lambda: _drawn(rng, seed, kind), 4000)
+    labels = (scene.objects[0].label,)
+    if kind.startswith("from"):
+        return Task("supports", seed, scene, labels, kind=kind, place=(x, y))
+    return Task("supports", seed, scene, labels, kind=kind, place_on=scene.objects[-1].label)
 
 
-def _drawn(rng: np.random.Generator, seed: int, kind: str) -> Scene | None:
-    """Draw a scene, the object first and what it goes to last; None where it does not fit."""
+def _drawn(rng: np.random.Generator, seed: int, kind: str) -> tuple[Scene, list[float]] | None:
+    """Draw a scene, the object first and what it goes to last, and where it goes; None where it does not fit."""
     item, other = (one.model_dump() for one in random_scene(int(rng.integers(1 << 31)), count=2).objects)
     colors = [str(color) for color in rng.permutation(list(PALETTE)) if color not in (item["color"], other["color"])]
     side, raised = float(rng.choice((-1.0, 1.0))), not kind.startswith("on")
@@ -64,6 +68,11 @@ def _drawn(rng: np.random.Generator, seed: int, kind: str) -> Scene | None:
     if kind == "box_to_box":
         parts.append(_box(rng, side, colors[1], nearest=-_ASIDE / 4.0))
         standing.append(parts[-1])
+    place = _top(parts[-1])
+    if kind.startswith("from"):
+        x, y = rng.uniform(*robot_work().region.x), side * rng.uniform(*robot_work().region.abs_y)
+        place = [round(float(x), 3), round(float(y), 3), robot_work().table.top_z]
+        standing.append({"position": place, "size": (_HAND, _HAND)})
     for a, b in combinations(standing, 2):
         radii = 0.5 * sum(math.hypot(*one["size"][:2]) for one in (a, b))
         if math.dist(a["position"][:2], b["position"][:2]) < radii + _APART:
@@ -74,20 +83,20 @@ def _drawn(rng: np.random.Generator, seed: int, kind: str) -> Scene | None:
         if error.code is not Code.SCENE_INVALID:
             raise
         return None  # over the edge of the table
-    return scene if _in_reach(scene, [] if kind.startswith("from") else [_top(parts[-1])]) else None
+    return (scene, place) if _in_reach(scene, place) else None
 
 
-def _in_reach(scene: Scene, places: list[list[float]]) -> bool:
-    """Whether an arm on the side of the first object can grasp it so that it reaches the place (3,), if any."""
+def _in_reach(scene: Scene, place: list[float]) -> bool:
+    """Whether an arm on the side of the first object can grasp it so that it reaches its place (3,)."""
     item, config = scene.objects[0], GraspConfig()
     target = Detection(item.label, 1.0, item.T_world_object(scene.table), np.array(item.size), item.shape != "box")
     context = GraspContext.of(config, scene.table, RobotDescription.load())
     for arm in context.arm_order("auto", float(target.p_base[1])):
         for grasp in propose(target, config, context.parts(arm))[:_GRASPS]:
             held = held_boxes(target, grasp, config)
-            ways = (PlanPlace(arm, place_targets(target, grasp, [np.array(p)], config), (), held) for p in places)
+            put = PlanPlace(arm, place_targets(target, grasp, [np.array(place)], config), (), held)
             take = PlanGrasp(arm, (grasp,), (), (target_box(target, config),))
-            if reaches(scene.table, take) and all(reaches(scene.table, way) for way in ways):
+            if reaches(scene.table, take) and reaches(scene.table, put):
                 return True
     return False
 
