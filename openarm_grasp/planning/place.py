@@ -32,8 +32,6 @@ from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, h
 SAME_SPOT = 0.02
 #: What reaches farther from its middle is large, m: distances to it are those to its outline, and so much.
 _LARGE = 0.05
-#: What is taller is in the way of a hand that stands over its neighbour, m: its outline counts.
-_TALL = 0.12
 #: A point of the table that is in view is this near to a spot that nothing hides, m.
 _SEEN = 0.03
 #: An object may be so much wider than what it is placed on, on each side, m.
@@ -202,13 +200,11 @@ def free_spots(
             f" {len(others)} other objects and {place.origin_distance * 1e3:.0f} mm from where it stood",
         )
     xy = np.array([spot[2:] for spot in clear])
-    around = [(d, distances_from(d, xy)) for d in others]
-    room = np.min([np.full(len(xy), inf), *(away for _, away in around)], axis=0)
-    tall = np.min([np.full(len(xy), inf), *(away for d, away in around if d.size[2] > _TALL)], axis=0)
+    room = np.min([np.full(len(xy), inf), *(distances_from(d, xy) for d in others)], axis=0)
     hidden = np.zeros(len(xy)) if seen is None or not len(seen) else KDTree(seen[:, :2]).query(xy)[0]
     ranked = [
-        (bool(free < reach), dark > _SEEN, min(clearance, high) < place.neighbour_room, cost, x, y)
-        for free, high, dark, (cost, clearance, x, y) in zip(room, tall, hidden, clear, strict=True)
+        (bool(free < reach), dark > _SEEN, clearance < place.neighbour_room, cost, x, y)
+        for free, dark, (cost, clearance, x, y) in zip(room, hidden, clear, strict=True)
     ]
     # Six spots side by side would share one fate, so those offered lie apart.
     chosen: list[Array] = []
