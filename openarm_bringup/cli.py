@@ -99,6 +99,17 @@ def run(argv: Sequence[str]) -> int:
         FOR_PEOPLE.reset(before)
 
 
+def _place_on(tokens: Sequence[str]) -> list[str]:
+    """Return a command line whose `--place on:THING` or `in:THING`, of one word, has an option of its own."""
+    found = list[str]()
+    for before, word in zip(("", *tokens), tokens, strict=False):
+        if before == "--place" and word.startswith(("on:", "in:")):
+            found[-1:] = ["--place-on", word[3:]]
+        else:
+            found.append(word)
+    return found
+
+
 def _run(tokens: Sequence[str], sink: str | None) -> int:
     if not tokens or tokens[0] in ("--help", "-h"):
         _print(_help())
@@ -107,7 +118,7 @@ def _run(tokens: Sequence[str], sink: str | None) -> int:
 
     try:
         with _READING:
-            command, bound, _ = build_app().parse_args(tokens, exit_on_error=False, print_error=False)
+            command, bound, _ = build_app().parse_args(_place_on(tokens), exit_on_error=False, print_error=False)
         result = command(*bound.args, **bound.kwargs)
     except CycloptsError as error:
         return _refuse(str(error), Code.INVALID_ARGUMENT, sink)

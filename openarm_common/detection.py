@@ -98,6 +98,11 @@ class Detection(Described):
         return float(self.T_base_object[2, 3] - self.size[2] / 2.0)
 
     @property
+    def foot(self) -> Array:
+        """Middle of the lower face, (3,), m."""
+        return np.array([*self.p_base[:2], self.bottom])
+
+    @property
     def yaw(self) -> float:
         """Angle of the x axis about the z axis of the base, rad in (-pi, pi]."""
         return float(np.arctan2(self.T_base_object[1, 0], self.T_base_object[0, 0]))

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from openarm_common.camera.cameras import CameraConfig, hand_cameras, load_cameras
 from openarm_common.robot.description import RobotDescription
@@ -12,6 +14,7 @@ from openarm_common.robot.folder import per_robot
 from openarm_common.robot.hand import Hand, HandParts
 from openarm_common.robot.work import Table
 from openarm_common.robot.zeros import HandReach
+from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.arms import Shoulders, arm_order
 from openarm_grasp.sampling.hand_shape import HandShape
@@ -80,6 +83,10 @@ class GraspContext:
     def arm_order(self, arm: str, y: float) -> tuple[str, ...]:
         """Arms to try for an object; see `openarm_grasp.planning.arms.arm_order`."""
         return arm_order(arm, y, self.config.approach.overlap_half_width, self.shoulders)
+
+    def on_table(self, xy: Sequence[float] | Array) -> Array:
+        """Return the point (3,) of the table at (2,) or (3,), base frame, m."""
+        return np.array([*xy[:2], self.table.top_z], dtype=np.float64)
 
     @property
     def clear_of_objects(self) -> float:

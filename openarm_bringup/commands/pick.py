@@ -33,6 +33,7 @@ def pick(
     arm: list[str] | None = None,
     at: list[tuple[float, float]] | None = None,
     place: list[tuple[float, float, float]] | None = None,
+    place_on: list[str] | None = None,
     yaw: list[float] | None = None,
     phase: Literal["all", "pick", "place", "aside"] = "all",
     time_limit: float = 0.0,
@@ -56,6 +57,8 @@ def pick(
         arm: Which arm: auto when not given.
         at: x y near the object, base frame, m: selects one of several alike.
         place: Where to: x y z of the footprint centre, base frame, m (z is not read: the table); chosen when not given.
+            Or on or in something in view: --place on:"blue box", --place in:tray.
+        place_on: What to place it on or in, as --place on:THING.
         yaw: Yaw of the object where it is put down, degrees about the vertical; unconstrained when not given.
         phase: pick ends with the object in the hand, place puts down what the hand holds; all does both. aside pushes
             the object away from where it is.
@@ -68,6 +71,7 @@ def pick(
     labels = (label, second) if second else (label,)
     arms, spots = _each("arm", arm, labels), _each("at", at, labels)
     places, yaws = _each("place", place, labels), _each("yaw", yaw, labels)
+    supports = _each("place-on", place_on, labels)
     if second and phase != "all":
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--phase {phase} is of one object; two are picked and placed")
     if second and confirm:
@@ -79,20 +83,20 @@ def pick(
 
     wanted: list[dict[str, Any]] = [
         {
-            "label": name,
+            "label": name if on is None else f"{name} on:{on}",
             "arm": which or "auto",
             "place": where,
             "place_yaw": None if turn is None else math.radians(turn),
             "object_at": spot,
         }
-        for name, which, where, turn, spot in zip(labels, arms, places, yaws, spots, strict=True)
+        for name, which, where, on, turn, spot in zip(labels, arms, places, supports, yaws, spots, strict=True)
     ]
     run: dict[str, Any] = {"dry_run": dry_run, "time_limit": time_limit, "speed": speed, "timeout": timeout}
     run["on_feedback"] = _Steps(labels)
     with requires_node("grasp", "sim"), GraspClient() as client:
         try:
             if second:
-                first, other = (GraspRequest(**request) for request in wanted)
+                first, other = (GraspRequest.of(request.pop("label"), **request) for request in wanted)
                 return _of_two(client.pick_two(first, other, **run), dry_run=dry_run)
             ask = confirm and (_runs if sys.stdin.isatty() else True)
             result = client.pick(**wanted[0], phase=phase, confirm=ask, **run)

@@ -61,8 +61,8 @@ class CampaignOptions:
     """What a campaign runs.
 
     Args:
-        set_name: nominal, clutter, faults, endurance, handover, push, pairs, pairs_in_turn, orders, objects or heap;
-            --set NAME means the same.
+        set_name: nominal, clutter, faults, endurance, handover, push, pairs, pairs_in_turn, orders, objects, heap or
+            supports; --set NAME means the same.
         seeds: One task each, such as 0-99 or 1,4,7-9; 0-9 when not given.
         workers: Processes.
         noise: Depth as noisy as a D435's.

@@ -30,7 +30,7 @@ from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, watch_clearance
 from openarm_evaluation.judging.judge import RULES, judge, rests, rise_of
 from openarm_evaluation.judging.provenance import scene_hash
-from openarm_evaluation.judging.trial import Step, Trial, choose_targets
+from openarm_evaluation.judging.trial import Step, Trial, choose_targets, higher_by
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.requests.orders import Order
@@ -156,7 +156,7 @@ class Trials:
     def _grasp(self, ask: GraspRequest) -> Trial:
         task, began, first = self._task, time.monotonic(), len(self.steps)
         self._begin(lifted=ask.phase == "place")
-        request = replace(ask, arm=task.arm, place=task.place)
+        request = replace(ask, arm=task.arm, place=task.place, place_on=task.place_on)
         try:
             outcome = self.link.run(carry_out(self.grasp_task(request)))
         except OpenArmError as error:
@@ -248,8 +248,9 @@ class Trials:
             name = min(lifted, key=lambda n: math.dist(robot.tracks[n][-1].p_world[:2], xy))
         if seen is not None and not outcome.attempts:  # nothing rose: that which was looked at
             name = min(names, key=lambda n: float(np.linalg.norm(robot.tracks[n][0].p_world - np.array(seen))))
-        corners = task.scene.object(name).corners
-        verdict = judge(robot.tracks[name], xy, claimed=outcome.success, corners=corners)
+        item = task.scene.object(name)
+        higher = higher_by(task.scene, item, task.place_on)
+        verdict = judge(robot.tracks[name], xy, claimed=outcome.success, corners=item.corners, higher=higher)
         return Trial(task.scene, task.seed, name, outcome, verdict, steps, wall_s, end_ns)
 
     def _rest(self, names: list[str]) -> None:

@@ -83,6 +83,7 @@ def judge(
     claimed: bool,
     rules: JudgeConfig = RULES,
     corners: Array | None = None,
+    higher: float = 0.0,
 ) -> Verdict:
     """Judge one object's track from before the grasp to after it.
 
@@ -97,6 +98,7 @@ def judge(
         claimed: Whether the run reported success.
         rules: Tolerances.
         corners: (n, 3) of an object of any shape, in its frame, m; None: a plain shape.
+        higher: By how much what it is to stand on is higher than what it stood on, m.
 
     Raises:
         ValueError: The track is empty or not in the order of time.
@@ -109,7 +111,7 @@ def judge(
     rise = rise_of(track)
     tilt = _tilt(first.q_xyzw, last.q_xyzw)
     moved, turned = _motion_at_end(track, rules)
-    sink = float(last.p_world[2] - first.p_world[2])
+    sink = float(last.p_world[2] - first.p_world[2]) - higher
     reasons: list[str] = []
     if rise < rules.lift:
         reasons.append(f"never lifted: it rose {1e3 * rise:.0f} mm, at least {1e3 * rules.lift:.0f} were expected")
@@ -126,7 +128,7 @@ def judge(
         if tilt > rules.tilt:
             reasons.append(f"not upright: tilted by {math.degrees(tilt):.0f} degrees")
         if abs(sink) > rules.height:
-            reasons.append(f"is not on the table as before: its centre is {1e3 * sink:+.0f} mm higher")
+            reasons.append(f"does not stand there as before: its centre is {1e3 * sink:+.0f} mm higher")
     if moved > rules.moved or turned > rules.turned:
         text = f"{1e3 * moved:.1f} mm and {math.degrees(turned):.1f} degrees in the last {rules.rest:g} s"
         reasons.append(f"not at rest: it moved {text}")

@@ -165,6 +165,19 @@ def wait_scene(observer: Observer, scene: Scene, after_ns: int) -> None:
     observer.wait(there, SETTLE_TIMEOUT_S, f"ground truth of scene {scene.name} at rest")
 
 
+def higher_by(scene: Scene, item: SceneObject, place_on: str) -> float:
+    """Return how much higher, m, an object is to stand than in the scene: on the table, or on what words ask for.
+
+    Raises:
+        OpenArmError: UNKNOWN_OBJECT, listing the objects of the scene.
+    """
+    floor, table = scene.table.top_z, scene.table
+    if place_on:
+        support = choose_targets(scene, place_on)[0]
+        floor = support.centre(table)[2] + 0.5 * support.size[2]
+    return floor - item.centre(table)[2] + 0.5 * item.size[2]
+
+
 def run_trial(
     observer: Observer,
     client: GraspClient,
@@ -199,9 +212,10 @@ def run_trial(
     observer.forget()
 
     def request() -> Sequence[GraspResult]:
-        return [client.pick(wanted.label or item.label, arm=wanted.arm, place=wanted.place)]
+        words = replace(wanted, label=wanted.label or item.label).words
+        return [client.pick(words, arm=wanted.arm, place=wanted.place)]
 
-    (trial,) = _observed(observer, scene, seed, [item], request, wanted.place)
+    (trial,) = _observed(observer, scene, seed, [item], request, wanted.place, wanted.place_on)
     return trial
 
 
@@ -234,6 +248,7 @@ def _observed(
     items: Sequence[SceneObject],
     request: Callable[[], Sequence[GraspResult | GraspOutcome]],
     place: tuple[float, ...] | None = None,
+    place_on: str = "",
 ) -> list[Trial]:
     """Request grasps of objects and judge each by where it was to be placed: as requested, else as the grasp chose."""
     for item in items:
@@ -253,7 +268,8 @@ def _observed(
         chosen = result.place_position if any(result.place_position) else (math.nan, math.nan)
         x, y = (place or chosen)[:2]
         track = observer.track(item.name)
-        verdict = judge(track, (x, y), claimed=result.success, corners=item.corners)
+        higher = higher_by(scene, item, place_on)
+        verdict = judge(track, (x, y), claimed=result.success, corners=item.corners, higher=higher)
         steps = [step for step in observer.steps() if len(items) == 1 or step.label in (item.label, result.label)]
         trials.append(Trial(scene, seed, item.name, result, verdict, _stamped(steps), wall_s))
     return trials

@@ -42,6 +42,8 @@ _CLOUDS = 3
 _PIECE = 0.010
 #: Of an object that has not moved more than this share is seen where it was; of one that has by 5 mm, less.
 _MOST = 0.95
+#: What stands on another thing, or in it, begins so much higher than that, m.
+_STACKED = 0.005
 #: An object of fewer points has no cloud.
 _LEAST_POINTS = 60
 
@@ -74,6 +76,11 @@ class Sighting:
     others: tuple[Detection, ...]
     t_ns: int
     clouds: tuple[LabelledCloud, ...] = ()
+
+    @property
+    def beside(self) -> tuple[Detection, ...]:
+        """Others, without what the object stands on or what stands on it."""
+        return tuple(d for d in self.others if not stacked(d, self.target))
 
 
 class UntrustedError(OpenArmError):
@@ -118,6 +125,12 @@ def picked(frame: Frame, detections: Sequence[Detection]) -> Frame:
 def apart(a: Detection, b: Detection) -> float:
     """Horizontal distance of two objects, m."""
     return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
+
+
+def stacked(a: Detection, b: Detection) -> bool:
+    """Whether one of two objects stands on the other, or in it."""
+    lower, upper = sorted((a, b), key=lambda d: d.bottom)
+    return upper.bottom - lower.bottom > _STACKED and not distances_from(lower, upper.p_base[None, :2]).any()
 
 
 def sticks_out(seen: Detection, stood: Detection) -> float:
@@ -387,18 +400,18 @@ _WHY = {
 }
 
 
-def on_table(d: Detection, table_z: float, *, reach: float = 0.03) -> Detection:
+def on_table(d: Detection, table_z: float, *, reach: float = 0.01) -> Detection:
     """Let a box that stands on the table end there: its top is measured, its bottom is usually hidden.
 
     Args:
         d: The box.
         table_z: Height of the table top, base frame, m.
-        reach: A bottom further than this from the table is believed (the object stands on something else), m.
+        reach: A bottom so much higher than the table is believed (the object stands on something else), m.
 
     Raises:
         OpenArmError: STALE_DATA, when the box is flatter than 5 mm: there is nothing to grasp.
     """
-    if abs(d.bottom - table_z) > reach:
+    if d.bottom - table_z > reach:
         return d
     height = d.top - table_z
     if height < 0.005:
@@ -425,6 +438,7 @@ def _others(
                     continue
             # The middle of what is seen of an object may lie near another one.
             rivals = (k for k in (target, *found) if k.label == d.label or (k.measured and d.measured))
+            rivals = (k for k in rivals if not stacked(k, d))
             if all(apart(d, known) > match_radius for known in rivals):
                 found.append(d)
     return tuple(found)

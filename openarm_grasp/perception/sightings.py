@@ -10,13 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.detection import Detection
+from openarm_common.detection import Detection, distances_from
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array, Floats
 from openarm_grasp.perception.detections import Sighting
 
+#: Edge of a column of points, m.
+COLUMN = 0.005
 #: Points so far out of the box of a thing are its own, m.
 _OUT = 0.004
+#: What is this near to the edges of something, or to what stands there, says nothing of its surface, m; nor do fewer
+#: columns.
+RIM, _FEW = 0.012, 20
+#: It is level where no more than this share of it is so much higher or lower, m.
+_LEVEL, _UNEVEN = 0.008, 0.25
 
 
 def object_points(clouds: Sequence[LabelledCloud]) -> Array:
@@ -39,6 +46,36 @@ def in_box(points: Array | Floats, one: Detection) -> NDArray[np.bool_]:
     """Which of the points (n, 3) are in the box about a thing."""
     local = se3.apply(se3.inverse(one.T_base_object), points.astype(np.float64))
     return np.asarray((np.abs(local) <= 0.5 * one.size + _OUT).all(axis=1), dtype=np.bool_)
+
+
+def tops(points: Array) -> Array:
+    """Highest point (n, 3) of each column of points, at its middle."""
+    cells = np.floor(points[:, :2] / COLUMN).astype(np.int64)
+    order = np.lexsort((cells[:, 1], cells[:, 0]))
+    cells = cells[order]
+    first = np.flatnonzero(np.diff(cells, axis=0, prepend=cells[:1] - 1).any(axis=1))
+    high = np.maximum.reduceat(points[order, 2], first)
+    return np.column_stack([(cells[first] + 0.5) * COLUMN, high]).astype(np.float64)
+
+
+def surface_of(one: Detection, found: Sighting) -> float:
+    """Height at which things stand on something, or in it, m: where it is level within its rim, else its top.
+
+    Args:
+        one: It; of `found.others`.
+        found: What was seen; without points, its top.
+    """
+    points = points_around(found.clouds[-1:])
+    points = tops(points[in_box(points, one)])
+    local = (points - one.p_base) @ one.T_base_object[:3, :3]
+    own = (np.abs(local[:, :2]) <= 0.5 * one.size[:2] - RIM).all(axis=1)
+    for other in found.others:
+        if other is not one and other.bottom >= one.bottom + _OUT:
+            own &= distances_from(other, points[:, :2]) > RIM
+    if np.count_nonzero(own) < _FEW:
+        return one.top
+    floor = float(np.median(points[own, 2]))
+    return floor if np.mean(np.abs(points[own, 2] - floor) > _LEVEL) <= _UNEVEN else one.top
 
 
 def joined(found: Sighting, parts: Sequence[Detection]) -> Sighting:
@@ -92,16 +129,19 @@ def _about(like: Detection, points: Array, whole: Sequence[Detection]) -> Detect
     return replace(like, T_base_object=T, size=high - low, kind="", round=False, measured=measured)
 
 
-def standing_at(target: Detection, xy: Sequence[float] | Array, turn: float = 0.0) -> Detection:
-    """The object as it would be observed elsewhere, turned by `turn` about the vertical unless it is round."""
-    p = np.array([xy[0], xy[1], target.p_base[2]])
+def standing_at(target: Detection, foot: Sequence[float] | Array, turn: float = 0.0) -> Detection:
+    """The object as it would be observed at a footprint centre (3,), or (2,) as high as it stands.
+
+    It is turned by `turn` about the vertical unless it is round.
+    """
+    p = np.array([*foot, target.bottom][:3]) + target.p_base - target.foot
     turn = 0.0 if target.round else turn
     return replace(target, T_base_object=se3.make(se3.rot_z(turn) @ target.T_base_object[:3, :3], p))
 
 
-def seen_at(found: Sighting, xy: Sequence[float] | Array, turn: float = 0.0) -> Sighting:
+def seen_at(found: Sighting, foot: Sequence[float] | Array, turn: float = 0.0) -> Sighting:
     """The object with its points as it would be observed elsewhere; as `standing_at`."""
-    there = standing_at(found.target, xy, turn)
+    there = standing_at(found.target, foot, turn)
     T = there.T_base_object @ se3.inverse(found.target.T_base_object)
     clouds: list[LabelledCloud] = []
     for cloud in found.clouds:

@@ -65,7 +65,7 @@ class FeasibilityCheck:
                 ways = offers(self._context, arm, found) if offered is None else offered
                 await self._robot.plan_grasp(arm, ways, found, now)
             else:
-                await self.pick_and_place(arm, found, (np.array(place[:2], dtype=np.float64),), yaw=yaw)
+                await self.pick_and_place(arm, found, (self._context.on_table(place),), yaw=yaw)
         except OpenArmError as error:
             if error.code not in NO_WAY:
                 raise
@@ -94,7 +94,7 @@ class FeasibilityCheck:
         Args:
             arm: Whose.
             found: The object and its neighbours.
-            spots: (2,) footprint centres, best first.
+            spots: (3,) footprint centres on what it is to stand on, best first.
             yaw: Yaw of the object there; None: unconstrained.
             used: Ways to put it down that are of no use.
 

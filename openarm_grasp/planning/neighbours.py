@@ -18,16 +18,14 @@ from openarm_common.detection import gap
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.perception.sightings import in_box, object_points, points_around
-from openarm_grasp.planning.candidates import UP, Box, obstacle_boxes
+from openarm_grasp.perception.sightings import COLUMN, RIM, in_box, object_points, points_around, surface_of, tops
+from openarm_grasp.planning.candidates import UP, Box, PlaceTarget, obstacle_boxes
 from openarm_grasp.sampling.slabs import slabs
 
 #: Share of its hull that something without inward corners covers, seen from above.
 _FULL = 0.8
 #: What stands this near to an object may keep a hand from it, m.
 _CLOSE = 0.04
-#: Edge of a column of points, m.
-_STEP = 0.005
 #: A plan keeps so far from obstacles, and what is lifted touches none of them at first, m.
 _APART = 0.005
 #: Boxes about a thing, and the share of its volume that a further one must save.
@@ -37,13 +35,17 @@ _MOST, _SAVED = 20, 0.02
 _NEARER = 0.003
 #: What reaches over an object by no more than this slides off it when it is lifted, m.
 _OVER = 0.015
+#: What is level within its rim, and so much lower there, is hollow, m.
+_HOLLOW = 0.01
+#: What is put down on something is this near to the top of a box about that, m, which is taken so much lower.
+_FACE, _LOWER = 0.012, 0.002
 #: Fewer points say nothing of a shape.
 _LEAST_POINTS = 30
 
 
 def crowded(found: Sighting) -> bool:
     """Whether something stands so close to an object that it may keep a hand from it."""
-    return any(gap(found.target, one) < _CLOSE for one in found.others)
+    return any(gap(found.target, one) < _CLOSE for one in found.beside)
 
 
 def cornered(found: Sighting) -> bool:
@@ -55,7 +57,7 @@ def cornered(found: Sighting) -> bool:
         hull = ConvexHull(cells[:, :2]).volume
     except QhullError:
         return False  # all on one line
-    return len(cells) * _STEP**2 < _FULL * hull
+    return len(cells) * COLUMN**2 < _FULL * hull
 
 
 def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tuple[Box, ...]:
@@ -71,11 +73,13 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     for one in found.others:
         whole = boxes[id(one)]
         own = seen[in_box(seen, one)] if not (one.kind and one.measured) else seen[:0]
-        if len(own) < _LEAST_POINTS:
+        if (deep := one.top - surface_of(one, found)) >= _HOLLOW:
+            made = _walled(whole, deep + config.approach.obstacle_margin)
+        elif len(own) < _LEAST_POINTS:
             made = (whole,)
         else:
-            made = slabs(one.label, columns(own, one.bottom), _STEP, most=_MOST, saved=_SAVED)
-            made = tuple(replace(box, size=np.maximum(box.size - 2.0 * _NEARER, _STEP)) for box in made)
+            made = slabs(one.label, columns(own, one.bottom), COLUMN, most=_MOST, saved=_SAVED)
+            made = tuple(replace(box, size=np.maximum(box.size - 2.0 * _NEARER, COLUMN)) for box in made)
         parts += [replace(box, id=f"{whole.id}/{n}" if len(made) > 1 else whole.id) for n, box in enumerate(made)]
     for box in held:
         parts = [cut for part in parts if (cut := _beside(part, box)) is not None]
@@ -84,27 +88,41 @@ def neighbours(found: Sighting, held: Sequence[Box], config: GraspConfig) -> tup
     return tuple(parts)
 
 
-def tops(points: Array) -> Array:
-    """Highest point (n, 3) of each column of points, at its middle."""
-    cells = np.floor(points[:, :2] / _STEP).astype(np.int64)
-    order = np.lexsort((cells[:, 1], cells[:, 0]))
-    cells = cells[order]
-    first = np.flatnonzero(np.diff(cells, axis=0, prepend=cells[:1] - 1).any(axis=1))
-    high = np.maximum.reduceat(points[order, 2], first)
-    return np.column_stack([(cells[first] + 0.5) * _STEP, high]).astype(np.float64)
+def _walled(whole: Box, deep: float) -> tuple[Box, ...]:
+    """A box that is hollow from above, to a depth, as its bottom and four walls."""
+    (x, y, z), wall = whole.size, RIM + _APART
+    sizes = [(x, y, z - deep), *[(wall, y, deep)] * 2, *[(x, wall, deep)] * 2]
+    shifts = [(0.0, 0.0, -0.5 * deep)]
+    shifts += [(sign * 0.5 * (x - wall), 0.0, 0.5 * (z - deep)) for sign in (1.0, -1.0)]
+    shifts += [(0.0, sign * 0.5 * (y - wall), 0.5 * (z - deep)) for sign in (1.0, -1.0)]
+    return tuple(
+        replace(whole, T_frame_box=whole.T_frame_box @ se3.make(p=shift), size=np.array(size))
+        for shift, size in zip(shifts, sizes, strict=True)
+    )
+
+
+def under(parts: Sequence[Box], places: Sequence[PlaceTarget]) -> tuple[Box, ...]:
+    """Boxes to keep clear of, lowered where something is to be put down on them."""
+    spots, found = np.unique([place.position for place in places], axis=0), list[Box]()
+    for part in parts:
+        off = np.abs((spots - part.T_frame_box[:3, 3]) @ part.T_frame_box[:3, :3]) - 0.5 * part.size
+        on = (off[:, :2] <= _CLOSE).all(axis=1) & (np.abs(off[:, 2]) <= _FACE)
+        lost = min(_LOWER - float(off[on, 2].min(initial=_LOWER)), float(part.size[2]) - 1e-3)
+        found.append(_cut(part, 2, lost, top=True) if lost > 0.0 else part)
+    return tuple(found)
 
 
 def standing_boxes(label: str, points: Array, floor: float, table_gap: float) -> tuple[Box, ...]:
     """Boxes about what reaches from its highest points (n, 3) down to a height, and a gap above that, m."""
-    return slabs(label, columns(points, floor), _STEP, gap=table_gap)
+    return slabs(label, columns(points, floor), COLUMN, gap=table_gap)
 
 
 def columns(points: Array, floor: float) -> Array:
     """Middles of voxels (n, 3) from the highest point of each column down to a height."""
     high = tops(points)
-    many = np.maximum(np.ceil((high[:, 2] - floor) / _STEP), 1.0).astype(np.int64)
+    many = np.maximum(np.ceil((high[:, 2] - floor) / COLUMN), 1.0).astype(np.int64)
     level = np.arange(int(many.sum())) - np.repeat(np.cumsum(many) - many, many)
-    return np.column_stack([np.repeat(high[:, :2], many, axis=0), floor + (level + 0.5) * _STEP]).astype(np.float64)
+    return np.column_stack([np.repeat(high[:, :2], many, axis=0), floor + (level + 0.5) * COLUMN]).astype(np.float64)
 
 
 def _beside(part: Box, held: Box) -> Box | None:
@@ -115,7 +133,7 @@ def _beside(part: Box, held: Box) -> Box | None:
     share = np.concatenate([above, below]) / np.tile(part.size, 2)
     best = int(share.argmin())
     lost = float(np.concatenate([above, below])[best])
-    if share[best] >= 1.0 or part.size[best % 3] - lost < _STEP / 2.0:
+    if share[best] >= 1.0 or part.size[best % 3] - lost < COLUMN / 2.0:
         return None
     return _cut(part, best % 3, lost, top=best < 3)
 
@@ -131,7 +149,7 @@ def _not_over(part: Box, held: Box, lift: float) -> Box | None:
     if lost[best] > _OVER + _APART:
         return part
     axis = best % 2
-    return _cut(part, axis, float(lost[best]), top=best < 2) if part.size[axis] - lost[best] >= _STEP / 2.0 else None
+    return _cut(part, axis, float(lost[best]), top=best < 2) if part.size[axis] - lost[best] >= COLUMN / 2.0 else None
 
 
 def _overlap(part: Box, held: Box) -> tuple[Array, Array]:

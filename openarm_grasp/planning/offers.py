@@ -53,12 +53,13 @@ def asked(context: GraspContext, arm: str, sighting: Sighting, failed: Sequence[
     """Return what a sampler is given; a surface where the points of the object are known. Arguments as `offers`."""
     config, surface = context.config_of(arm), None
     if sighting.clouds:
-        surface = fuse(views_of(sighting.clouds, context.table.top_z), context.table.top_z, step=config.cloud.voxel)
+        floor = sighting.target.bottom
+        surface = fuse(views_of(sighting.clouds, floor), floor, step=config.cloud.voxel)
     return Sampling(
         sighting.target,
         config,
         context.parts(arm),
-        sighting.others,
+        sighting.beside,
         context.shoulders.get(arm, (0.0, 0.0)),
         surface,
         None if surface is None else context.shape(arm),

@@ -13,20 +13,31 @@ from itertools import product
 from math import hypot, inf
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from openarm_common import se3
 from openarm_common.detection import Detection, distances_from
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.work import Table
-from openarm_common.types import Array
+from openarm_common.types import Array, Floats
+from openarm_common.wanted import describe, select
 from openarm_grasp.config import GraspConfig, PlaceConfig
 from openarm_grasp.evidence.verdicts import SQUARE_WITHIN
-from openarm_grasp.perception.detections import Frame
+from openarm_grasp.perception.detections import Frame, Sighting
+from openarm_grasp.perception.sightings import surface_of
 from openarm_grasp.planning.arms import Shoulders, sides
 from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, hold_of
 
 #: Spots nearer to each other than this are one, m.
 SAME_SPOT = 0.02
+#: What reaches farther from its middle is large, m: distances to it are those to its outline, and so much.
+_LARGE = 0.05
+#: A point of the table that is in view is this near to a spot that nothing hides, m.
+_SEEN = 0.03
+#: An object may be so much wider than what it is placed on, on each side, m.
+_OVERHANG = 0.01
+#: Grid of spots there, their distance from what stands there, and room around that is enough for a hand, m.
+_SPOT_STEP, _NEXT, _HAND_ROOM = 0.02, 0.005, 0.08
 
 
 def place_targets(
@@ -43,7 +54,7 @@ def place_targets(
     Args:
         target: The object as it stood at the grasp.
         candidate: How it is held.
-        spots: (2,) or (3,) footprint centres, base frame, m, best first; z is not read.
+        spots: (3,) footprint centres on what it is to stand on, base frame, m, best first; (2,): as high as it stood.
         config: Parameters.
         used: Targets that have failed before: their spots (where there are others) or turns come last.
         yaw: Yaw of the object's x axis about the base z when it stands there, rad; None: any.
@@ -61,14 +72,14 @@ def place_targets(
     order = sorted(ranked, key=lambda r: r[0])
     found: list[PlaceTarget] = []
     for rank, i, yaw in order:
-        x, y = float(spots[i][0]), float(spots[i][1])
-        p = np.array([x, y, target.p_base[2] + config.place.release_height])
+        foot = np.array([*spots[i], target.bottom][:3], dtype=np.float64)
+        p = foot + (target.p_base[2] - target.bottom + config.place.release_height) * UP
         T_base_tcp = se3.make(se3.rot_z(yaw) @ target.T_base_object[:3, :3], p) @ T_object_tcp
         found.append(
             PlaceTarget(
                 id=f"spot{i}/yaw{np.degrees(yaw):+.0f}",
                 T_base_tcp=T_base_tcp,
-                position=np.array([x, y, target.bottom]),
+                position=foot,
                 yaw_offset=yaw,
                 approach_offset=config.approach.pregrasp_distance * UP,
                 retreat_offset=-config.approach.pregrasp_distance * T_base_tcp[:3, 2],
@@ -154,6 +165,7 @@ def free_spots(
     shoulders: Shoulders,
     choices: Sequence[Sequence[float]] = (),
     *,
+    seen: Array | Floats | None = None,
     every: bool = False,
 ) -> tuple[Array, ...]:
     """Free spots, best first: of those that may be chosen, or anywhere on the arm's side of the table.
@@ -169,6 +181,7 @@ def free_spots(
         config: Parameters.
         shoulders: Of the arms.
         choices: (x, y) of spots, base frame, m; none: a grid on the arm's side.
+        seen: (n, 3) points of the table that are in view: spots that nothing hides come first; None: all are.
         every: As many as there are, not only `config.place.spots`.
 
     Raises:
@@ -188,9 +201,10 @@ def free_spots(
         )
     xy = np.array([spot[2:] for spot in clear])
     room = np.min([np.full(len(xy), inf), *(distances_from(d, xy) for d in others)], axis=0)
+    hidden = np.zeros(len(xy)) if seen is None or not len(seen) else KDTree(seen[:, :2]).query(xy)[0]
     ranked = [
-        (bool(free < reach), clearance < place.neighbour_room, cost, x, y)
-        for free, (cost, clearance, x, y) in zip(room, clear, strict=True)
+        (bool(free < reach), dark > _SEEN, clearance < place.neighbour_room, cost, x, y)
+        for free, dark, (cost, clearance, x, y) in zip(room, hidden, clear, strict=True)
     ]
     # Six spots side by side would share one fate, so those offered lie apart.
     chosen: list[Array] = []
@@ -219,10 +233,13 @@ def clear_spots(
         from, less the clearance up to twice the distance asked for.
     """
     found: list[tuple[float, float, float, float]] = []
-    for spot in spots:
-        x, y = float(spot[0]), float(spot[1])
+    xys = np.array([[float(spot[0]), float(spot[1])] for spot in spots])
+    outlines = [distances_from(d, xys) + _LARGE for d in others]  # of what is large the middle may be far
+    edges = np.min([np.full(len(xys), inf), *outlines], axis=0)
+    for (x, y), edge in zip(xys.tolist(), edges.tolist(), strict=True):
         origin = hypot(x - target.p_base[0], y - target.p_base[1])
         clearance = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
+        clearance = min(clearance, edge)
         if origin >= config.origin_distance and clearance >= config.neighbour_distance:
             found.append((origin - min(clearance, 2.0 * config.neighbour_distance), clearance, x, y))
     return found
@@ -263,6 +280,47 @@ def check_position(position: Sequence[float], target: Detection, others: Sequenc
                 f" {target.label!r} does not fit there",
             )
     return p
+
+
+def spots_on(name: str, found: Sighting, config: PlaceConfig) -> tuple[Array, ...]:
+    """Free spots on the top of something in view, or in it, best first: those with most room around, then the middle.
+
+    Args:
+        name: Words for it.
+        found: The object that is to stand there, and what is around it.
+        config: How many spots are offered.
+
+    Returns:
+        (3,) footprint centres on its surface, base frame, m.
+
+    Raises:
+        OpenArmError: UNKNOWN_OBJECT or NOTHING_DETECTED, naming what may carry; PLACE_FAILED, when nothing is free.
+    """
+    target, others = found.target, found.others
+    try:
+        support = select(name, others)[0]
+    except OpenArmError as error:
+        text = f"no {name!r} to place {target.label!r} on or in; in view: {describe(others)}"
+        raise OpenArmError(error.code, text) from error
+    standing = [d for d in others if d is not support and distances_from(support, d.p_base[None, :2])[0] == 0.0]
+    floor = surface_of(support, found)
+    reach = 0.5 * float(max(target.size[:2]))
+    room = 0.5 * support.size[:2] - reach
+    if (room < -_OVERHANG).any():
+        raise OpenArmError(
+            Code.PLACE_FAILED,
+            f"{target.label!r} does not fit on {name!r}, which is {support.size[0] * 1e3:.0f} mm ×"
+            f" {support.size[1] * 1e3:.0f} mm large",
+        )
+    axes = [np.linspace(-r, r, 1 + 2 * int(r / _SPOT_STEP)) if r > 0.0 else np.zeros(1) for r in room]
+    flat = np.array(list(product(*axes))) @ support.T_base_object[:2, :2].T + support.p_base[:2]
+    free = np.min([np.full(len(flat), inf), *(distances_from(d, flat) for d in standing if d.top > floor)], axis=0)
+    away = np.linalg.norm(flat - support.p_base[:2], axis=1)
+    order = [i for i in np.lexsort((away, -np.minimum(free, _HAND_ROOM).round(3))) if free[i] >= reach + _NEXT]
+    if not order:
+        text = f"no free spot on {name!r}: {len(standing)} objects stand there, and {target.label!r} needs"
+        raise OpenArmError(Code.PLACE_FAILED, f"{text} {reach * 1e3:.0f} mm around its middle")
+    return tuple(np.array([*flat[i], floor]) for i in order[: 2 * config.spots])
 
 
 def grid(low: float, high: float, step: float) -> Array:

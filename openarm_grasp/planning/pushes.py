@@ -23,9 +23,9 @@ from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import NEXT_TO, Sighting
-from openarm_grasp.perception.sightings import in_box, object_points, points_around
+from openarm_grasp.perception.sightings import in_box, object_points, points_around, tops
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, tips_height
-from openarm_grasp.planning.neighbours import standing_boxes, tops
+from openarm_grasp.planning.neighbours import standing_boxes
 
 #: Between two points of a hand's shape, m.
 _GRAIN = 0.005

@@ -171,7 +171,7 @@ def centre_of_mass(solid: Array, target: Detection, failed: Sequence[FailedGrasp
     Returns:
         (3,) base frame.
     """
-    foot, centre = np.array([*target.p_base[:2], target.bottom]), np.asarray(solid.mean(axis=0), dtype=np.float64)
+    foot, centre = target.foot, np.asarray(solid.mean(axis=0), dtype=np.float64)
     turned = [(past.heavy, past.offset[:2]) for past in failed if past.heavy is not None]
     for heavy, offset in turned:
         held, now = float(offset @ heavy), float((centre - foot)[:2] @ heavy)
@@ -199,7 +199,7 @@ def most_like(candidate: GraspCandidate, offered: Sequence[GraspCandidate]) -> G
 
 
 def _offset(candidate: GraspCandidate, target: Detection) -> Array:
-    return candidate.T_base_tcp[:3, 3] - np.array([*target.p_base[:2], target.bottom])
+    return candidate.T_base_tcp[:3, 3] - target.foot
 
 
 def _angle(a: Array, b: Array) -> float:

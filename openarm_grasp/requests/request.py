@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.printable import LONGEST_TEXT, check_length
+from openarm_common.printable import LONGEST_TEXT, brief, check_length
 from openarm_common.types import Array
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 Spot = tuple[float, float]
 #: Slowest motions, as a share of the limits of the joints.
 LEAST_SCALE = 0.001
+#: What to pick, and what to put it on or in.
+_ON = re.compile(r"(.*?)\s*\b(?:on|in):\s*(\S.*)", re.DOTALL)
 #: What a request may ask for.
 PHASES = ("all", "pick", "place", "aside")
 
@@ -50,6 +53,7 @@ class GraspRequest:
         place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
         why: What it is for, when it is a part of another request.
         same: The object, when an earlier part of the request was about it: as it was seen or left then.
+        place_on: What it is to stand on or in, in words; "": the table.
     """
 
     label: str
@@ -67,6 +71,19 @@ class GraspRequest:
     place_choices: tuple[Spot, ...] = ()
     why: str = ""
     same: Sighting | None = None
+    place_on: str = ""
+
+    @classmethod
+    def of(cls, words: str, **fields: Any) -> GraspRequest:
+        """Return the request for words such as `red`, `red on:blue box` or `red in:tray`."""
+        found = _ON.fullmatch(words)
+        label, place_on = found.groups() if found else (words, "")
+        return cls(label, place_on=place_on, **fields)
+
+    @property
+    def words(self) -> str:
+        """What `of` reads: the label, and what to put it on."""
+        return f"{self.label} on:{self.place_on}" if self.place_on else self.label
 
     def about(self, same: Sighting) -> GraspRequest:
         """The request, for this object alone; it may have moved since."""
@@ -102,9 +119,12 @@ class GraspRequest:
         Raises:
             OpenArmError: INVALID_ARGUMENT.
         """
-        for name in ("label", "arm", "phase"):
+        for name in ("label", "arm", "phase", "place_on"):
             check_length(getattr(self, name), name)
         check_arm(self.arm, arms)
+        if self.place_on and self.place is not None:
+            text = f"two places: on:{self.place_on} and {brief(str(self.place))}; give one"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
         if self.phase not in PHASES:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"phase {self.phase!r} does not exist; valid: {', '.join(PHASES)}"
@@ -126,6 +146,7 @@ def command(requests: Sequence[GraspRequest]) -> str:
         "--arm": [None if first.arm == "auto" and len(requests) == 1 else (request.arm,) for request in requests],
         "--at": [request.object_at for request in requests],
         "--place": [request.place and (*request.place, 0.0)[:3] for request in requests],
+        "--place-on": [(request.place_on,) if request.place_on else None for request in requests],
         "--yaw": [None if request.place_yaw is None else (math.degrees(request.place_yaw),) for request in requests],
     }
     for name, values in options.items():

@@ -31,7 +31,7 @@ from openarm_grasp.planning.candidates import (
     target_box,
     target_boxes,
 )
-from openarm_grasp.planning.neighbours import neighbours
+from openarm_grasp.planning.neighbours import neighbours, under
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
@@ -233,6 +233,7 @@ class Skills:
         """
         held = held_boxes(found.target, candidate, self._config)
         obstacles = neighbours(found, target_boxes(found.target, candidate, self._config), self._config)
+        obstacles = under(obstacles, ways)
         stood, lift = target_box(found.target, self._config), self._config.approach.lift_height
         grown = np.array([2.0 * _CELL, 2.0 * _CELL, lift])
         column = Box(stood.id, se3.make(p=(0.0, 0.0, 0.5 * lift)) @ stood.T_frame_box, stood.size + grown)

@@ -211,7 +211,7 @@ class GraspClient(BackgroundNode):
         goal = PickTwo.Goal(dry_run=dry_run, timeout=time_limit, velocity_scale=speed)
         for request, wanted in zip(goal.requests, (first, second), strict=True):
             asked = GraspRequest(wanted) if isinstance(wanted, str) else wanted
-            request.label, request.arm = asked.label, asked.arm
+            request.label, request.arm = asked.words, asked.arm
             _where(request, asked)
         answer: PickTwo.Result = self._ask(PickTwo, "/grasp/pick_two", goal, timeout, on_feedback)
         results = tuple(_result(one) for one in answer.results)

@@ -68,8 +68,8 @@ def requests_from_msg(goal: PickTwo.Goal) -> tuple[GraspRequest, GraspRequest]:
 def _request(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
     """What all of them have in common."""
     p, at = message.place_position, message.object_position
-    return GraspRequest(
-        label=message.label,
+    return GraspRequest.of(
+        message.label,
         arm=message.arm or "auto",
         place=(p.x, p.y, p.z) if message.has_place_position else None,
         place_yaw=message.place_yaw if message.has_place_yaw else None,

@@ -31,7 +31,7 @@ from openarm_grasp.planning.arms import out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, little_turns, shorter
 from openarm_grasp.planning.neighbours import crowded, standing_boxes
 from openarm_grasp.planning.options import NO_WAY, NoWayError, not_placeable, options_of, planned
-from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets
+from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, spots_on
 from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import Grasp
@@ -48,6 +48,8 @@ _SHORTEST = 0.35
 _FAR_FROM_WEIGHT = 0.8
 #: The middle of two things is that of the one where it is no farther off, m; things so near to them are a heap, m.
 _ONE_MIDDLE, _AMONG = 0.01, 0.15
+#: What is seen this near to the height of the table is table, m.
+_TABLE = 0.015
 #: An object that is observed so may be trusted in the next frames.
 _NOT_TRUSTED = (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT, Code.STALE_DATA)
 
@@ -195,6 +197,8 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
     request, target, table = run.request, sighting.target, run.context.table
     if request.place is not None:
         check_position(request.place, target, sighting.others, table)
+    if request.place_on:
+        spots_on(request.place_on, sighting, run.config.place)
     run.options, why = {}, ""
     arms = run.context.arm_order(request.arm, float(target.p_base[1]))
     arms = retries.arms_to_try(arms, run.failed)
@@ -288,10 +292,11 @@ async def _plan_with(
         # Also without a place that is asked for: no free spot is a reason not to lift.
         grasp = run.grasp = grasp_of(run, arm, sighting, candidate)
         chosen = f"grasp {candidate.id} with the {arm} arm"
-        # a hand that leans may find no way to a spot among other things
-        among = grasp.of_cloud and bool(sighting.others) and request.phase == "all"
+        # a hand that leans may find no way to a spot among other things, nor one that passes what it has cleared
+        raised = sighting.target.bottom > run.context.table.top_z + _TABLE
+        among = (grasp.of_cloud or raised) and bool(sighting.others) and request.phase == "all"
         shown = request.dry_run or (request.confirm and request.phase == "all")
-        if request.place is None and not (among or shown):
+        if request.place is None and not (request.place_on or among or shown):
             return grasp, found, chosen
         run.enter(State.PLAN, f"{chosen}; planning the place")
         try:
@@ -318,14 +323,20 @@ async def _plan_with(
 def grasp_of(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) -> Grasp:
     """A grasp with the ways to put the object down: where it was asked for, or on free spots."""
     request, target, others, table = run.request, sighting.target, sighting.others, run.context.table
-    if request.place is not None:
-        spots = (check_position(request.place, target, others, table),)
+    if request.place_on:
+        spots = spots_on(request.place_on, sighting, run.config.place)
+    elif request.place is not None:
+        spots = (run.context.on_table(check_position(request.place, target, others, table)),)
     else:
         # what a hand has kept because it could not be put down has to go somewhere
         every, shoulders = run.kept is not None, run.context.shoulders
-        spots = free_spots(arm, target, others, run.config, shoulders, request.place_choices, every=every)
+        seen = [cloud.points[np.abs(cloud.points[:, 2] - table.top_z) < _TABLE] for cloud in sighting.clouds[-1:]]
+        flat = free_spots(
+            arm, target, others, run.config, shoulders, request.place_choices, seen=next(iter(seen), None), every=every
+        )
+        spots = tuple(map(run.context.on_table, flat))
     places = place_targets(target, candidate, spots, run.config, run.used_places, yaw=request.place_yaw)
-    adjacent = tuple(d for d in others if d.measured and gap(d, target) < NEXT_TO)
+    adjacent = tuple(d for d in sighting.beside if d.measured and gap(d, target) < NEXT_TO)
     return Grasp(arm, sighting, candidate, places, adjacent=adjacent)
 
 
@@ -339,7 +350,7 @@ def regrasped(run: Run, grasp: Grasp, sighting: Sighting) -> Grasp:
     run.findings.sighting, run.place_plan = sighting, None
     before, now, merged = grasp.sighting, sighting.target, tuple[Detection, ...]()
     shift = float(np.linalg.norm((now.p_base - before.target.p_base)[:2]))
-    if shift > _ONE_MIDDLE and any(gap(d, now) < _AMONG for d in sighting.others):
+    if shift > _ONE_MIDDLE and any(gap(d, now) < _AMONG for d in sighting.beside):
         merged = tuple(d for d in before.others if d.measured and all(d is not one for one in sighting.others))
     return replace(grasp_of(run, grasp.arm, sighting, candidate), closed=grasp.closed, merged=merged)
 

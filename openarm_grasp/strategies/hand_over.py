@@ -38,7 +38,7 @@ class HandOver:
     Attributes:
         giver: The arm that brings the object to the middle.
         taker: The arm that takes it from there.
-        spot: (2,) where it stands in between.
+        spot: (3,) where it stands in between.
         yaw: Yaw of its x axis there, rad.
     """
 
@@ -49,7 +49,7 @@ class HandOver:
 
     def __str__(self) -> str:
         """Sentence for the status."""
-        x, y = self.spot
+        x, y, _ = self.spot
         return (
             f"the {self.giver} arm brings it to the middle, ({x:.3f}, {y:.3f}) m, and the {self.taker} arm from there"
             " to its place"
@@ -78,7 +78,7 @@ async def hand_over(task: Task) -> GraspOutcome | None:
             text = f"can be done from ({x:.3f}, {y:.3f}) m: {way}"
             return replace(known, code=Code.OK, message=text, arm=way.taker, proof=Feasible(str(way)))
         again = "" if number == 1 else f", at try number {number}"
-        x, y = (float(v) for v in way.spot)
+        x, y, _ = (float(v) for v in way.spot)
         why = f"hand-over, 1 of 2: {way}"
         bring = replace(asked.about(found), arm=way.giver, place=(x, y), place_yaw=way.yaw, why=why)
         brought = await pick_and_place(task, bring)
@@ -130,7 +130,7 @@ async def plan_hand_over(task: Task, seen: Sighting) -> HandOver:
     Raises:
         OpenArmError: NO_PLAN or PLACE_FAILED, with what each arm lacks; what the robot raises.
     """
-    spots = middle_spots(seen.target, seen.others, task.context)
+    spots = [task.context.on_table(xy) for xy in middle_spots(seen.target, seen.others, task.context)]
     shoulders, y, faults = task.context.shoulders, seen.target.p_base[1], list[str]()
     for giver, taker in sorted(permutations(shoulders, 2), key=lambda two: abs(shoulders[two[0]][1] - y)):
         try:
@@ -154,7 +154,7 @@ async def _between(task: Task, seen: Sighting, giver: str, taker: str, spots: Se
             if error.code not in NO_WAY or not fault:
                 raise
             break
-        found = HandOver(giver, taker, way.position[:2], seen.target.yaw + way.yaw_offset)
+        found = HandOver(giver, taker, way.position, seen.target.yaw + way.yaw_offset)
         there = seen_at(seen, way.position, way.yaw_offset)
         refusal, copes = None, -1
         for stands in (there, *_around(there, config)):

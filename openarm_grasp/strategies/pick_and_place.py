@@ -368,7 +368,7 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
             why = f"{error.message}; putting it back"
         run.place_target = None
         target = grasp.sighting.target
-        back = place_targets(target, grasp.candidate, (target.p_base[:2],), run.config)
+        back = place_targets(target, grasp.candidate, (target.foot,), run.config)
         # first from where the lift has brought it: it has come that way, between things that stand close to it
         lifted = grasp.candidate.retreat_offset
         ways = (*(replace(way, id=f"{way.id}/lifted", approach_offset=lifted) for way in back), *back)

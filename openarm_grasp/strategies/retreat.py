@@ -112,7 +112,7 @@ async def _put_back(run: Run, grasp: Grasp) -> None:
             if error.code not in NO_WAY:
                 raise
             target = grasp.sighting.target
-            way = place_targets(target, candidate, (target.p_base[:2],), config)[0]
+            way = place_targets(target, candidate, (target.foot,), config)[0]
             back = robot.T_base_tcp(arm)[:3, 3] - T_back[:3, 3]  # it has come that way
             if back @ candidates.UP > 0.0:
                 way = replace(way, approach_offset=back)

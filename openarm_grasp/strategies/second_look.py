@@ -59,7 +59,8 @@ def _seen_again(run: Run, grasp: Grasp, seen: Frames) -> Grasp:
     found = _found(run, grasp, seen)
     if not found.target.measured:
         raise OpenArmError(Code.NOTHING_DETECTED, "only a part of it is seen from there")
-    before, target = grasp.sighting.target, on_table(found.target, run.context.table.top_z)
+    before = grasp.sighting.target
+    target = on_table(found.target, before.bottom, reach=np.inf)  # from near, little of what it stands on is in view
     # A box that is observed again may have its edges swapped.
     sighting = replace(grasp.sighting, target=target)
     ways = run.ways(grasp.arm, replace(sighting, clouds=()))

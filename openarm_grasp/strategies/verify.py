@@ -109,7 +109,7 @@ def _seen(frame: Frame, run: Run, grasp: Grasp, target: PlaceTarget) -> CameraVe
     hand has moved it. Where no place was asked for, such is where it is seen.
     """
     request, place, before = run.request, target.position, grasp.sighting.target
-    in_part = not before.measured or any(gap(d, before) < NEXT_TO for d in grasp.sighting.others)
+    in_part = not before.measured or any(gap(d, before) < NEXT_TO for d in grasp.sighting.beside)
     tolerance = _SEEN_WITHIN * run.config.place.tolerance
     points, within = first_points(grasp.sighting), _PART_WITHIN if in_part else tolerance
     T_base_now, moved = judge_moved(points, grasp.motion_to(target), frame, within, in_part=in_part)
@@ -121,7 +121,7 @@ def _seen(frame: Frame, run: Run, grasp: Grasp, target: PlaceTarget) -> CameraVe
     if came_next_to(seen, frame, grasp.sighting):
         text = "what is seen next to it was not there before: it may be a part of it, and its middle is not known"
         return _unproven(text)
-    if in_part and request.place is None and not request.place_choices:
+    if in_part and request.place is None and not (request.place_on or request.place_choices):
         run.place_target = replace(target, position=np.array([*now.p_base[:2], place[2]]))
         return moved
     middles = np.concatenate([now.p_base[None, :2], least_box_middles(seen[:, :2])])

@@ -14,7 +14,7 @@ from openarm_perception.segmentation.clusters import Cluster, segment
 from openarm_perception.segmentation.divide import SegmentationConfig
 from openarm_perception.segmentation.support import support_at
 
-#: Nothing on the table is taller than this, m.
+#: Nothing is taller than this over what it stands on, m.
 _TALLEST = 0.30
 #: What is found: things that a hand may take whole, flat ones too.
 _CONFIG = SegmentationConfig(least_height=0.005, faint=0.5, join_parts=True)
@@ -29,13 +29,15 @@ def clusters(view: View, localizer: Localizer) -> tuple[Detection2D, ...]:
     """
     points = Deprojector(localizer.limits).organised(view.depth, view.intrinsics)
     support = support_at(points, view.T_base_camera, localizer.table_height)
+    over = 0.0 if view.levels is None else view.levels.height[view.levels.under]
     with np.errstate(invalid="ignore"):
-        apart = support.heights(points) > _TALLEST
+        apart = support.heights(points) - over > _TALLEST
     if view.robot is not None:
         apart |= view.robot
     found = segment(
-        points, view.intrinsics, _CONFIG, rgb=view.rgb, T_base_camera=view.T_base_camera, robot=apart, support=support
-    )
+        points, view.intrinsics, _CONFIG, rgb=view.rgb, T_base_camera=view.T_base_camera, robot=apart, support=support,
+        levels=view.levels,
+    )  # fmt: skip
     return tuple(sorted((_detection(one) for one in found.clusters), key=lambda one: -one.area))
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_common.camera.depth_view import DepthView, unit_scale
+from openarm_common.camera.depth_view import DepthView
 from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Floats
@@ -24,9 +24,7 @@ _SPARSE, _FAR = 2, 4
 
 def smooth_depth(view: View, limits: DepthLimits) -> Floats:
     """Return the depth (h, w) of an image without the noise of single pixels, m; NaN where none counts."""
-    z = view.depth.astype(np.float32) * np.float32(unit_scale(view.depth))
-    z = np.where((z >= limits.near) & (z <= limits.far), z, np.float32(np.nan))
-    return smoothed(z, view.intrinsics)
+    return smoothed(view.metres(limits), view.intrinsics)
 
 
 def labelled_cloud(

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a detection in the image to an object in the base frame: position, yaw, size. Usable without ROS.
 
-The base frame has z up; the table is a horizontal plane at a known height. The object is modelled as a prism on
-it (a box, an upright cylinder or can): its top gives the height, the outline of the top centre, yaw and footprint.
+The base frame has z up; the table is a horizontal plane at a known height, and other level surfaces over it are found
+by depth. The object is modelled as a prism on the one under it (a box, an upright cylinder or can): its top gives the
+height, the outline of the top centre, yaw and footprint.
 
 The outline is found where neighbouring pixels part. Where the far pixel lies lower, the edge is the ray between the
 two, cut with the plane of the top. Points on the sides of the object are on its outline already. So edges are known
@@ -29,8 +30,9 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_perception.detection.detector import Detection2D, Mask
 from openarm_perception.geometry import footprint, plane
-from openarm_perception.geometry.depth import DepthLimits, View
-from openarm_perception.geometry.patch import Patch, cut
+from openarm_perception.geometry.depth import Deprojector, DepthLimits, View
+from openarm_perception.geometry.levels import find_levels
+from openarm_perception.geometry.patch import Patch, cut, denoise
 
 if TYPE_CHECKING:
     from openarm_perception.segmentation.clusters import Cluster
@@ -107,9 +109,18 @@ class Localizer:
         self.table_height = table_height
         self._heights = config.known_heights()
 
+    def levelled(self, view: View) -> View:
+        """Return a view with the surfaces over its table that things stand on."""
+        lens, T = view.intrinsics, view.T_base_camera
+        smooth, _ = denoise(view.metres(self.limits), 2.0 / (lens.fx + lens.fy))
+        points = Deprojector(self.limits).organised(smooth.astype(np.float32), lens) @ T[:3, :3].T.astype(np.float32)
+        points += (T[:3, 3] - (0.0, 0.0, self.table_height)).astype(np.float32)
+        apart = np.zeros(view.depth.shape, np.bool_) if view.robot is None else view.robot
+        return replace(view, levels=find_levels(points, apart, self.config.table_margin))
+
     def cut(self, found: Detection2D, view: View) -> Patch:
         """Cut out the neighbourhood of a detection, for the methods below; errors as `patch.cut`."""
-        return cut(found, view, self.limits, self.config.top_band)
+        return cut(found, view, self.limits, self.config.top_band, self.table_height)
 
     def locate(self, patch: Patch) -> LocatedObject:
         """Locate the object of a detection.
@@ -143,7 +154,7 @@ class Localizer:
                 shape = footprint.bound(patch.points[solid][:, :2], pixel, pixel)
         except OpenArmError as error:
             raise _refusal(found, error.code, f": {error.message}") from error
-        return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
+        return self._detection(found, shape, (patch.floor, top), int(np.count_nonzero(solid)), visible)
 
     def _of_cluster(self, patch: Patch, cluster: Cluster) -> LocatedObject:
         """Return what the segmentation has found out already: of a prism its shape, else the box around its points."""
@@ -155,7 +166,7 @@ class Localizer:
         T = cluster.T_frame_box
         level = replace(shape, centre=T[:2, 3], yaw=math.atan2(T[1, 0], T[0, 0]) if shape.kind != "circle" else 0.0)
         top = float((T @ (0.0, 0.0, 0.5 * cluster.size[2], 1.0))[2])
-        return self._detection(found, level, top, cluster.pixels, 1.0)
+        return self._detection(found, level, (patch.floor, top), cluster.pixels, 1.0)
 
     def enclose(self, patch: Patch, withheld: OpenArmError | None = None) -> LocatedObject:
         """Enclose what is visible of a detection that cannot be measured, an obstacle. It is marked as not measured.
@@ -177,7 +188,7 @@ class Localizer:
         top = self._top_height(points[:, 2], patch.band)
         pixel = float(np.median(patch.z[solid])) / patch.intrinsics.fx
         shape = footprint.bound(points[:, :2], pixel, 3.0 * pixel)
-        around = self._detection(patch.found, shape, top, len(points), 0.0)
+        around = self._detection(patch.found, shape, (patch.floor, top), len(points), 0.0)
         kind, code = kind_of(patch.found.kind, around.size), withheld.code if withheld else around.code
         return replace(around, score=patch.found.score, kind=kind, measured=False, code=code)
 
@@ -209,7 +220,7 @@ class Localizer:
         # a wrong height moves the object along the view: half of it, as its bottom stays where it is
         lean = 0.5 * self.config.height_std * float(np.linalg.norm(middle[:2] - camera[:2])) / (camera[2] - top)
         stds = (math.hypot(shape.centre_std[0], lean), math.hypot(shape.centre_std[1], lean))
-        located = self._detection(found, replace(shape, centre_std=stds), top, 0, 1.0)
+        located = self._detection(found, replace(shape, centre_std=stds), (self.table_height, top), 0, 1.0)
         located.covariance[2, 2] = (0.5 * self.config.height_std) ** 2
         return replace(located, from_depth=False)
 
@@ -218,7 +229,7 @@ class Localizer:
         return np.asarray(patch.mask & np.isfinite(patch.z))
 
     def _on_object(self, patch: Patch) -> Mask:
-        """Return points of the object, or of the table around it."""
+        """Return points of the object, or of what it stands on around it."""
         found, valid = patch.found, self._valid(patch)
         count = int(np.count_nonzero(valid))
         if count < self.config.min_points:
@@ -228,12 +239,12 @@ class Localizer:
         return valid & gate
 
     def _solid(self, patch: Patch) -> Mask:
-        """Return points of the object above the table."""
-        solid = self._on_object(patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
+        """Return points of the object above the surface that it stands on."""
+        solid = self._on_object(patch) & (patch.points[..., 2] > patch.floor + self.config.table_margin)
         count = int(np.count_nonzero(solid))
         if count < self.config.min_points:
-            text = f" has {count} points above the table at {self.table_height:.3f} m, expected at least"
-            text += f" {self.config.min_points}; is it flat, or is the table height wrong?"
+            text = f" has {count} points above the table (or what is under it) at {patch.floor:.3f} m, expected"
+            text += f" at least {self.config.min_points}; is it flat, or is the table height wrong?"
             raise _refusal(patch.found, Code.NOTHING_DETECTED, text)
         return solid
 
@@ -274,7 +285,7 @@ class Localizer:
             hidden += int(np.count_nonzero(hides))
             distance = np.linalg.norm(patch.points[far] - patch.points[near], axis=1)
             # a near neighbour is a hole in the mask, another colour or a side of the object: no silhouette
-            close = (distance <= self.config.side_step) & (patch.points[far][:, 2] > self.table_height + margin)
+            close = (distance <= self.config.side_step) & (patch.points[far][:, 2] > patch.floor + margin)
             seen += int(np.count_nonzero(~hides))
             ridge = flank[far] & close & ~hides
             edge = ~(close | hides) | ridge
@@ -285,12 +296,13 @@ class Localizer:
         return np.concatenate(found), seen / max(seen + hidden, 1)
 
     def _detection(
-        self, found: Detection2D, shape: footprint.Footprint, top: float, count: int, visible: float
+        self, found: Detection2D, shape: footprint.Footprint, ends: tuple[float, float], count: int, visible: float
     ) -> LocatedObject:
+        floor, top = ends
         # lower only where heights say nothing
-        height = max(top - self.table_height, self.config.table_margin)
+        height = max(top - floor, self.config.table_margin)
         R = se3.rot_z(shape.yaw)
-        T = se3.make(R, (*shape.centre, self.table_height + height / 2.0))
+        T = se3.make(R, (*shape.centre, floor + height / 2.0))
         std = np.maximum([*shape.centre_std, 0.5 * self.config.std_floor], self.config.std_floor)
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = R @ np.diag(std**2) @ R.T

@@ -126,14 +126,15 @@ class Pipeline:
         check_size("depth image", depth.shape, intrinsics)
         unit_scale(depth)
         size = (intrinsics.width, intrinsics.height)
-        view = View(rgb, depth, intrinsics, T_base_camera, robot)
+        view = self.localizer.levelled(View(rgb, depth, intrinsics, T_base_camera, robot))
         detected = self.detect(view)
+        unseen = carriers(view, detected)
         found = rank(self.faults.seen(detected.found, t_ns), self.policy, size)
         doubts = self.faults.seen(detected.doubts, t_ns)
         located: list[LocatedObject] = []
         refused: list[str] = []
         unmeasured: list[LocatedObject] = []
-        for detection, doubt in [*((one, "") for one in found), *((one.found, one.why) for one in doubts)]:
+        for detection, doubt in [*((one, "") for one in found), *((one.found, one.why) for one in (*doubts, *unseen))]:
             patch = self.localizer.cut(detection, view)
             try:
                 if doubt:
@@ -184,6 +185,8 @@ class Pipeline:
         return ImageDetections(self.detector.detect(view.rgb))
 
 
+#: Name of what carries something and was not detected itself.
+SUPPORT = "support"
 #: Pixels around a box of a network that are examined: its sides are that exact.
 _MARGIN = 4
 #: An object has a colour when this share of its pixels has it.
@@ -329,6 +332,23 @@ def make_pipeline(
     return Pipeline(colors, localizer, policy, label)
 
 
+def carriers(view: View, detected: ImageDetections) -> tuple[Doubt, ...]:
+    """Return the surfaces that something stands on and of which nothing was detected: obstacles."""
+    if view.levels is None:
+        return ()
+    taken = np.zeros(view.depth.shape, np.bool_)
+    for one in (*detected.found, *(doubt.found for doubt in detected.doubts)):
+        (u, v), (w, h) = one.origin, one.size
+        taken[v : v + h, u : u + w] |= one.mask
+    size, found = (view.intrinsics.width, view.intrinsics.height), list[Doubt]()
+    for number in range(1, len(view.levels.height)):
+        face = view.levels.face == number
+        shown = _detection(face, (0, 0), size, SUPPORT, 1.0)
+        if shown is not None and np.mean(taken[face]) < _SAME:
+            found.append(Doubt(shown, f"{SUPPORT}: nothing was detected that it is the top of"))
+    return tuple(found)
+
+
 def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D | None:
     """Cut out the object in a box: what rises above the table there and has the colour of its middle.
 
@@ -357,6 +377,9 @@ def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D |
     core &= standing & (solid if (solid & core).any() else True)
     if not core.any():
         return None
+    if view.levels is not None:  # neither what it stands on, nor what stands on it
+        standing &= view.levels.under[rows, columns] == view.levels.of((rows, columns), core)
+        core &= standing
     alike = _alike(view.rgb[rows, columns], core)
     plain = np.count_nonzero(alike & core) >= 0.5 * np.count_nonzero(core)
     # what is of many colours is separated from the background by depth alone

@@ -19,6 +19,7 @@ from openarm_common.camera.depth_view import DepthImage, check_size, unit_scale
 from openarm_common.config import Config
 from openarm_common.kernels import kernel
 from openarm_common.types import Array, Bytes, Mask
+from openarm_perception.geometry.levels import Levels
 
 Points = NDArray[np.float32]
 
@@ -91,6 +92,7 @@ class View:
         intrinsics: Intrinsics of both.
         T_base_camera: (4, 4) optical frame in the base frame.
         robot: (h, w) pixels that show the robot or what it holds; None when it was not searched for.
+        levels: Surfaces over the table that things stand on; None: all stand on the table.
     """
 
     rgb: Bytes
@@ -98,6 +100,12 @@ class View:
     intrinsics: Intrinsics
     T_base_camera: Array
     robot: Mask | None = None
+    levels: Levels | None = None
+
+    def metres(self, limits: DepthLimits) -> NDArray[np.float32]:
+        """Return the depth (h, w), m; NaN where none counts."""
+        z = self.depth.astype(np.float32) * np.float32(unit_scale(self.depth))
+        return np.where((z >= limits.near) & (z <= limits.far), z, np.float32(np.nan))
 
     def heights(self, limits: DepthLimits, window: tuple[slice, slice] | None = None) -> NDArray[np.float32]:
         """Return the heights (h, w) of the pixels in the base frame, m; NaN without a depth that counts.
@@ -107,8 +115,7 @@ class View:
             window: Rows and columns; all without it.
         """
         rows, columns = window or (slice(0, self.intrinsics.height), slice(0, self.intrinsics.width))
-        z = self.depth[rows, columns].astype(np.float32) * np.float32(unit_scale(self.depth))
-        z[~((z >= limits.near) & (z <= limits.far))] = np.nan
+        z = self.metres(limits)[rows, columns]
         lens, up = self.intrinsics, self.T_base_camera[2]
         x = (np.arange(rows.start, rows.stop) - lens.cy) / lens.fy * up[1] + up[2]
         y = (np.arange(columns.start, columns.stop) - lens.cx) / lens.fx * up[0]

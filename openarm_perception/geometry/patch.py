@@ -46,6 +46,7 @@ class Patch:
     coloured: Mask  # the object by colour
     robot: Mask  # the robot and what it holds
     band: float  # heights within this of the top are top, m
+    floor: float  # height of the surface under the object, base frame, m
 
     @property
     def mask(self) -> Mask:
@@ -53,14 +54,15 @@ class Patch:
         return self.coloured & ~self.robot
 
 
-def cut(found: Detection2D, view: View, limits: DepthLimits, top_band: float) -> Patch:
-    """Return the patch of a detection.
+def cut(found: Detection2D, view: View, limits: DepthLimits, top_band: float, table: float) -> Patch:
+    """Return the patch of a detection, without what stands on it.
 
     Args:
         found: In the colour image.
         view: The frame; what is the robot is no part of the object, but may hide it.
         limits: Depths that count.
         top_band: Heights within this of the top are top where the depth is clean, m.
+        table: Height of the table, m.
 
     Raises:
         OpenArmError: BAD_IMAGE, when image and intrinsics disagree.
@@ -81,10 +83,15 @@ def cut(found: Detection2D, view: View, limits: DepthLimits, top_band: float) ->
     rays = in_camera @ T_base_camera[:3, :3].T
     coloured = np.zeros(z.shape, np.bool_)
     coloured[v - v0 : v - v0 + h, u - u0 : u - u0 + w] = found.mask
+    if view.levels is not None:
+        levels, window = view.levels, (slice(v0, v1), slice(u0, u1))
+        number = levels.of(window, coloured)
+        coloured &= levels.height[levels.under[window]] <= levels.height[number]
+        table += float(levels.height[number])
     hidden = np.zeros(z.shape, np.bool_) if view.robot is None else view.robot[v0:v1, u0:u1]
     band = max(top_band, 3.0 * noise)
     points = rays * z[..., None] + T_base_camera[:3, 3]
-    return Patch(found, intrinsics, T_base_camera, rays, z, points, coloured, hidden, band)
+    return Patch(found, intrinsics, T_base_camera, rays, z, points, coloured, hidden, band, table)
 
 
 def denoise(z: Array | NDArray[np.float32], pixel: float) -> tuple[Array, float]:

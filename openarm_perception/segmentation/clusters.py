@@ -12,6 +12,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.types import Array, Bytes, Mask
 from openarm_perception.geometry.depth import Points
+from openarm_perception.geometry.levels import Levels
 from openarm_perception.segmentation.background import nearer, noise_between
 from openarm_perception.segmentation.divide import SegmentationConfig, divide
 from openarm_perception.segmentation.outline import Outline, survey
@@ -33,7 +34,7 @@ class Cluster:
         mask: (h, w) bool, its pixels within the window.
         points: (n, 3) float32 of those of its pixels that lie on a surface, without their noise, in row order, m; base
             frame, or the camera's where its pose is not known.
-        height: Height of its highest place over the support, m.
+        height: Height of its highest place over the surface that it stands on, m.
         outline: What lies beyond its outline.
         shape: Whether a prism fits it.
         T_frame_box: (4, 4) middle of the box around it, in the frame of the points; z away from the support.
@@ -65,7 +66,7 @@ class Segmentation:
     Attributes:
         label: (h, w) uint16, 0: no thing; else the `id` of a cluster.
         clusters: Largest (area) first; their ids are 1, 2, …
-        support: What they stand on.
+        support: What they stand on, or what carries them.
         heights: (h, w) float32 over it, m; NaN where nothing was measured.
     """
 
@@ -85,8 +86,9 @@ def segment(
     robot: Mask | None = None,
     background: Points | None = None,
     support: Support | None = None,
+    levels: Levels | None = None,
 ) -> Segmentation:
-    """Find what stands on the table in the organised cloud of one camera.
+    """Find what stands on the table, or on other things there, in the organised cloud of one camera.
 
     Args:
         points: (h, w, 3) float32, optical frame, m; NaN where nothing was measured.
@@ -98,6 +100,7 @@ def segment(
         background: (h, w, 3) as `points`, of the empty table or box; the support is found there, and what is no nearer
             than it is no thing.
         support: What things stand on, where that is known.
+        levels: Surfaces over it that things stand on; None: they are searched.
 
     Raises:
         OpenArmError: BAD_IMAGE, for a background of another place; NOTHING_DETECTED, when there is no plane that things
@@ -111,12 +114,12 @@ def segment(
     if background is not None:
         support = replace(support, noise=noise_between(points, background, support.noise))
         apart = robot | ~nearer(points, background, support.noise, config.sigmas, config.least_height)
-    divided = divide(points, intrinsics, support, config, apart, rgb)
+    divided = divide(points, intrinsics, support, config, apart, rgb, levels)
     T = np.eye(4) if T_base_camera is None else T_base_camera
-    image = _Image(points, divided.even, divided.surface, intrinsics, support, T, robot, rgb)
+    image = _Image(points, divided.even, divided.surface, intrinsics, support, divided.levels, T, robot, rgb)
     label, found = divided.label, image.clusters(divided.label)
     if config.join_parts:
-        root = joined(found, label, divided.pieces)
+        root = joined(found, label, divided.pieces, _carried(divided.levels, label, len(found)))
         _, number = np.unique(root, return_inverse=True)
         if len(found) and number.max() + 1 < len(found):
             label = np.concatenate([[0], number + 1]).astype(np.uint16)[label]
@@ -133,25 +136,26 @@ class _Image:
     surface: Points
     intrinsics: Intrinsics
     support: Support
+    levels: Levels
     T_frame_camera: Array
     robot: Mask
     rgb: Bytes | None
 
     def clusters(self, label: NDArray[np.uint16]) -> tuple[Cluster, ...]:
         """Return the things 1, 2, … of a label image."""
-        support = self.support
-        outlines = survey(label, self.even, self.robot, support.noise)
-        T_plane_camera = se3.make(np.stack([*support.axes.T, support.normal]), (0.0, 0.0, support.offset))
-        return tuple(self._cluster(label, i, one, T_plane_camera) for i, one in enumerate(outlines, start=1))
+        outlines = survey(label, self.even, self.robot, self.support.noise)
+        return tuple(self._cluster(label, i, one) for i, one in enumerate(outlines, start=1))
 
-    def _cluster(self, label: NDArray[np.uint16], i: int, outline: Outline, T_plane_camera: Array) -> Cluster:
-        window, T = _window(label, i), self.T_frame_camera
+    def _cluster(self, label: NDArray[np.uint16], i: int, outline: Outline) -> Cluster:
+        window, T, support = _window(label, i), self.T_frame_camera, self.support
+        # from the surface under it
+        eye = support.offset - float(self.levels.height[self.levels.of(window, label[window] == i)])
+        T_plane_camera = se3.make(np.stack([*support.axes.T, support.normal]), (0.0, 0.0, eye))
         mask, local, z = label[window] == i, self.surface[window], self.points[window][..., 2]
         other = ((label[window] != 0) & ~mask) | self.robot[window]
         lens = self.intrinsics
         shape = judge(
-            mask, other, z, _rays(lens, window, T_plane_camera), self.support.offset, outline.cut,
-            2.0 / (lens.fx + lens.fy),
+            mask, other, z, _rays(lens, window, T_plane_camera), eye, outline.cut, 2.0 / (lens.fx + lens.fy)
         )  # fmt: skip
         T_plane_box = se3.make(se3.rot_z(shape.footprint.yaw), (*shape.footprint.centre, shape.height / 2.0))
         color = None
@@ -162,6 +166,15 @@ class _Image:
         size = np.array([*shape.footprint.size, shape.height])
         T_frame_box = T @ se3.inverse(T_plane_camera) @ T_plane_box
         return Cluster(i, window, mask, placed, shape.height, outline, shape, T_frame_box, size, color)
+
+
+def _carried(levels: Levels, label: NDArray[np.uint16], count: int) -> NDArray[np.bool_]:
+    """Return which of the things (n, n) carry each other, also by what stands between them."""
+    pairs = np.indices((count, count)).reshape(2, -1).T + 1
+    found = levels.carry(label, pairs).reshape(count, count)
+    for _ in levels.height:
+        found |= found @ found
+    return found | found.T
 
 
 def _window(label: NDArray[np.uint16], i: int) -> tuple[slice, slice]:

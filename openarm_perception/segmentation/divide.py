@@ -16,6 +16,7 @@ from openarm_common.camera.flying_pixels import label_lonely
 from openarm_common.config import Config
 from openarm_common.types import Array, Bytes, Mask
 from openarm_perception.geometry.depth import Points
+from openarm_perception.geometry.levels import Levels, find_levels
 from openarm_perception.geometry.patch import denoise, keep_edges
 from openarm_perception.segmentation.colors import join_alike, join_smooth
 from openarm_perception.segmentation.grouping import partition
@@ -45,6 +46,8 @@ _NARROW = 1.0
 _FILLED = 2
 #: Unless they lie behind it by more than slant and as many standard deviations of the depth.
 _BEHIND = 4.0
+#: What stands on another thing rises over it by this multiple of the least height of a thing.
+_CARRIED = 2.0
 
 
 class SegmentationConfig(Config):
@@ -83,6 +86,7 @@ class Divided:
         surface: (h, w, 3) such points that lie on a surface, also at its edges; NaN where a pixel floats between two.
         heights: (h, w) float32 of those over the support, m.
         pieces: Of how many pieces each thing is, which its colours alone have joined.
+        levels: Surfaces over the support that things stand on.
     """
 
     label: NDArray[np.uint16]
@@ -91,6 +95,7 @@ class Divided:
     surface: Points
     heights: NDArray[np.float32]
     pieces: tuple[int, ...]
+    levels: Levels
 
 
 def divide(
@@ -100,6 +105,7 @@ def divide(
     config: SegmentationConfig,
     apart: Mask,
     rgb: Bytes | None = None,
+    levels: Levels | None = None,
 ) -> Divided:
     """Divide what rises above the support among things.
 
@@ -110,6 +116,7 @@ def divide(
         config: What counts as a thing.
         apart: (h, w) pixels of no thing, such as those of the robot.
         rgb: (h, w, 3) uint8; None: parts of one colour are not joined.
+        levels: Surfaces over the support that things stand on; None: they are searched.
     """
     pixel = 2.0 / (intrinsics.fx + intrinsics.fy)
     noise = np.float32(support.noise)
@@ -117,6 +124,11 @@ def divide(
     smooth, left = denoise(z, pixel)
     even = _points(smooth, intrinsics)
     heights = support.heights(even)
+    if levels is None:
+        flat = np.concatenate([even @ support.axes.astype(np.float32), heights[..., None]], axis=-1)
+        levels = find_levels(flat, apart, _CARRIED * config.least_height)
+    else:
+        levels = levels.over(heights)
     # without the noise of single pixels, what is as low as that may be a thing
     quiet = replace(support, noise=_noise_left(heights, smooth, support.noise))
     raised = _connected(
@@ -127,13 +139,14 @@ def divide(
     flying = _flying(z, pixel, support.noise)
     wanted = raised & ~flying
     size = _patch_size(z[wanted], pixel, support.noise, config)
-    broken = breaks(points, wanted, pixel, noise)
+    broken = breaks(points, wanted, pixel, noise) | levels.ends()
     strength = edge_strength(masked_normals(points, wanted, max(2, size // 2), noise), wanted, max(2, size // 2))
     patch = grow_patches(strength, broken, wanted, size)
     moments = patch_moments(points, patch, int(patch.max()) + 1)
     # metres across of a pixel at a patch, squared
     area = moments[:, 0] * (pixel * moments[:, 3] / np.maximum(moments[:, 0], 1.0)) ** 2
     border = borders(patch, broken, points)
+    border = border[~(levels.carry(patch, border[:, :2]) | levels.carry(patch, border[:, 1::-1]))]
     root, _ = partition(moments, border, support.noise)
     root = _join_small(root, patch, area, moments[:, 0], border, size, config)
     if rgb is not None and config.join_colors:
@@ -145,7 +158,7 @@ def divide(
     pieces = tuple(len(np.unique(piece[(number == i) & (piece > 0)])) for i in range(1, int(number.max()) + 1))
     label = _filled(number[patch], np.where(raised, z, np.nan), pixel, noise)
     surface = _points(np.where(flying, np.nan, keep_edges(z, smooth, left, pixel)), intrinsics)
-    return Divided(label, patch, even, surface, heights, pieces)
+    return Divided(label, patch, even, surface, heights, pieces, levels)
 
 
 def _points(z: Array, intrinsics: Intrinsics) -> Points:

@@ -38,13 +38,19 @@ _LONG, _WIDE = 0.38, 0.20
 _BODY = 0.095
 
 
-def joined(clusters: Sequence[Cluster], label: NDArray[np.uint16], pieces: Sequence[int] = ()) -> Ints:
+def joined(
+    clusters: Sequence[Cluster],
+    label: NDArray[np.uint16],
+    pieces: Sequence[int] = (),
+    carried: NDArray[np.bool_] | None = None,
+) -> Ints:
     """Return the group (n,) of each cluster: the index of its first one.
 
     Args:
         clusters: Of one image.
         label: (h, w) their numbers 1, 2, … at each pixel, 0: none.
         pieces: Of how many pieces each is already; none: of one.
+        carried: (n, n) which carry each other: these are no parts of one thing; None: none do.
     """
     root = np.arange(len(clusters))
     clouds = [one.points.astype(np.float64) for one in clusters]
@@ -52,6 +58,8 @@ def joined(clusters: Sequence[Cluster], label: NDArray[np.uint16], pieces: Seque
     pairs: list[tuple[float, int, int]] = []
     for i, a in enumerate(clusters):
         for j, b in enumerate(clusters[:i]):
+            if carried is not None and carried[i, j]:
+                continue
             gap, unknown = _gap(clouds[i], clouds[j]), "unknown" in (a.shape.kind, b.shape.kind)
             if unknown and next_to[i, j] and _nearest(clouds[i][:, :2], clouds[j][:, :2], _HIDDEN) <= _HIDDEN:
                 gap = min(gap, _TOUCH)

@@ -19,6 +19,7 @@ from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_perception.geometry.depth import Points
+from openarm_perception.geometry.levels import outside
 from openarm_perception.segmentation.kernels import local_normals
 
 #: Noise at 1 m, m, that is assumed first, and the range within which it is measured: from industrial structured light
@@ -92,10 +93,7 @@ class Support:
 
     def outside(self, points: Array) -> Array:
         """Return how far points (n, 3) are beyond the outline of what is seen of the plane, m (n,); negative inside."""
-        flat, along = points @ self.axes, np.roll(self.hull, -1, axis=0) - self.hull
-        turn = 1.0 if float(np.sum(self.hull[:, 0] * along[:, 1] - self.hull[:, 1] * along[:, 0])) > 0.0 else -1.0
-        side = along[:, 0] * (flat[:, None, 1] - self.hull[:, 1]) - along[:, 1] * (flat[:, None, 0] - self.hull[:, 0])
-        return np.asarray((-turn * side / np.maximum(np.linalg.norm(along, axis=1), 1e-9)).max(axis=1))
+        return outside(self.hull, points @ self.axes)
 
 
 def find_support(points: Points, up: Array | None = None) -> Support:

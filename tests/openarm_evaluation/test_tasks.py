@@ -65,7 +65,7 @@ def test_an_object_to_push_is_drawn_at_the_same_place_by_a_seed():
     def first(seed: int) -> str:
         return two_arms._one_object(seed, np.random.default_rng([seed, 5])).model_dump_json()
 
-    assert {*KNOWN, "push", *THINGS} == set(SUITES)
+    assert {*KNOWN, "push", "supports", *THINGS} == set(SUITES)
     assert digest(first, 21) == "e235d8f3dc89ed06"
 
 

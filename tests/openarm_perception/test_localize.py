@@ -193,7 +193,7 @@ def test_the_covariance_is_turned_with_the_object(localizer) -> None:
     """What is uncertain along a side of a box is so along that side in the base frame."""
     shape = Footprint("rectangle", np.array([0.3, 0.1]), 0.5, (0.05, 0.1), 1e-4, (4e-3, 1e-3), 0.01)
     seen = Detection2D("box", 1.0, (0.5, 0.5), (1, 1), np.ones((1, 1), bool), truncated=False)
-    found = localizer._detection(seen, shape, 0.45, 100, 1.0)
+    found = localizer._detection(seen, shape, (0.40, 0.45), 100, 1.0)
     along = np.array([math.cos(0.5), math.sin(0.5), 0.0])
     assert math.sqrt(along @ found.covariance[:3, :3] @ along) == pytest.approx(4e-3)
 

@@ -180,7 +180,7 @@ def _row(observer: Observer, client: GraspClient, task: Task, scenes: Path) -> R
         if task.together:
             trials = run_pair(observer, client, task.scene, task.labels, seed=task.seed, after_ns=after_ns)
         else:
-            asks = [GraspRequest(label, task.arm, task.place) for label in task.labels]
+            asks = [GraspRequest(label, task.arm, task.place, place_on=task.place_on) for label in task.labels]
             trials = [
                 run_trial(observer, client, task.scene, ask, seed=task.seed, after_ns=after_ns, moved=k > 0)
                 for k, ask in enumerate(asks)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_evaluation.campaign.tasks.faults import fault_task
+from openarm_evaluation.campaign.tasks.supports import supports_task
 from openarm_evaluation.campaign.tasks.task import Task, clutter, endurance, nominal
 from openarm_evaluation.campaign.tasks.things import THINGS, heap_task, objects_task
 from openarm_evaluation.campaign.tasks.two_arms import handover_task, in_turn_task, order_task, pair_task, push_task
@@ -23,6 +24,7 @@ SUITES = {
     "orders": order_task,
     "objects": objects_task,
     "heap": heap_task,
+    "supports": supports_task,
 }
 #: Those that two arms share, or whose objects stand between two arms.
 OF_TWO_ARMS = ("handover", "push", "pairs", "pairs_in_turn", "orders")

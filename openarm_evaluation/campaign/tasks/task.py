@@ -56,6 +56,7 @@ class Task:
         dynamics_seed: Seed of motors, masses and joint zeros; None: that of the configuration.
         hand_seed: Seed of stops and friction of the fingers; None: that of the configuration.
         place: (x, y) of the requested footprint centre, base frame, m; None: chosen by the suite.
+        place_on: What it is to stand on or in, in words; "": the table.
         posture: Joints that start elsewhere than at home, rad by name.
         clear: Repeated labels are several objects: what was placed stays where it is.
         route: By which it must come to its place, as `GraspOutcome.route`; "": any.
@@ -76,6 +77,7 @@ class Task:
     dynamics_seed: int | None = None
     hand_seed: int | None = None
     place: tuple[float, float] | None = None
+    place_on: str = ""
     posture: Mapping[str, float] = field(default_factory=dict[str, float])
     clear: bool = False
     route: str = ""

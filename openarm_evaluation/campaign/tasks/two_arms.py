@@ -26,10 +26,10 @@ from openarm_evaluation.campaign.tasks.task import Task, crowded_scene, past, wi
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.sightings import standing_at
-from openarm_grasp.planning.candidates import GraspCandidate, propose, shorter, target_box
+from openarm_grasp.planning.candidates import propose, shorter, target_box
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.pushes import closed_hand, destinations, push_ways
-from openarm_grasp.robot.interface import PlanGrasp
+from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
 from openarm_motion.planning.approach import plan_approach
 
 #: Least distance of an object of a hand-over, and of its place, from the near end of the region, m: the other arm
@@ -143,25 +143,27 @@ def _to_push(scene: Scene) -> bool:
     def graspable(there: Detection) -> bool:
         grasps = propose(there, config, context.hand)
         return any(
-            _reaches(scene.table, arm, ways, there)
+            reaches(scene.table, PlanGrasp(arm, ways, (), (target_box(there, config),)))
             for arm in robot.arm_names
             for ways in (grasps, tuple(shorter(one) for one in grasps))
         )
 
     def pushable(end: Array) -> bool:
         ways = {arm: push_ways(target, end, config, closed_hand(robot, arm), context.hand) for arm in robot.arm_names}
-        return any(_reaches(scene.table, arm, behind, target) for arm, behind in ways.items())
+        return any(
+            reaches(scene.table, PlanGrasp(arm, behind, (), (target_box(target, config),)))
+            for arm, behind in ways.items()
+        )
 
     ends = [end for end in destinations(target, (), context) if end[0] < target.p_base[0]]
     return not graspable(target) and any(pushable(end) and graspable(standing_at(target, end)) for end in ends)
 
 
-def _reaches(table: Table, arm: str, ways: tuple[GraspCandidate, ...], target: Detection) -> bool:
+def reaches(table: Table, asked: PlanGrasp | PlanPlace) -> bool:
     """Whether an arm at home finds a plan for an object that is known without an error."""
-    solver = arms_behind((), table)[arm]
+    solver = arms_behind((), table)[asked.arm]
     try:
-        request = approach_of(PlanGrasp(arm, ways, (), (target_box(target, GraspConfig()),)))
-        plan_approach(solver, solver.start_state(_home()), request)
+        plan_approach(solver, solver.start_state(_home()), approach_of(asked))
     except OpenArmError as error:
         if error.code not in NO_WAY:
             raise
