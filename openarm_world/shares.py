@@ -83,9 +83,9 @@ def fit(
 
     Args:
         points: (n, 3) as of `explain`, at least one.
-        T_motion: As of `explain`.
-        view: As of `explain`.
-        config: As of `explain`.
+        T_motion: Same as for `explain`.
+        view: Same as for `explain`.
+        config: Same as for `explain`.
         turns: Whether it may have turned about the vertical, too, and not only shifted.
     """
     some = points[:: max(1, len(points) // _POINTS)]

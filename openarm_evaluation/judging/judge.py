@@ -98,7 +98,7 @@ def judge(
         claimed: Whether the run reported success.
         rules: Tolerances.
         corners: (n, 3) of an object of any shape, in its frame, m; None: a plain shape.
-        higher: By how much what it is to stand on is higher than what it stood on, m.
+        higher: Height of what it is to stand on over what it stood on, m.
 
     Raises:
         ValueError: The track is empty or not in the order of time.

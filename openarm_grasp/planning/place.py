@@ -288,7 +288,7 @@ def spots_on(name: str, found: Sighting, config: PlaceConfig) -> tuple[Array, ..
     Args:
         name: Words for it.
         found: The object that is to stand there, and what is around it.
-        config: How many spots are offered.
+        config: Number of spots that are offered.
 
     Returns:
         (3,) footprint centres on its surface, base frame, m.

@@ -40,8 +40,8 @@ async def verify(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]
 
     Args:
         run: The request.
-        grasp: How the hand held the object.
-        placed: Where the hand has put it.
+        grasp: Hold of the hand on the object.
+        placed: Place where the hand has put it.
         frames: Frames taken as the arm came home; others are taken when they do not show it.
 
     Raises:
