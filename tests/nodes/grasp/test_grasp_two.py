@@ -96,11 +96,16 @@ def test_one_request_at_a_time_and_the_newest_status_is_of_the_one_that_is_at_wo
     assert bench.ros.result(result, 60.0).result.success
     bench.until(lambda: (bench.status[-1].state, bench.status[-1].label) == ("IDLE", "blue"), what="blue is done")
     assert bench.ask("red", dry_run=True).success
-    bench.world.asked.clear()
-    twice = ask(bench, "red", "red")
-    assert (twice.code, twice.outcome, len(twice.results)) == ("INVALID_ARGUMENT", "REFUSED", 0)
-    assert "'red' is asked for twice" in twice.message
-    assert bench.world.asked == []
+
+
+@pytest.mark.long
+def test_words_that_fit_several_objects_are_for_two_and_not_for_one_twice(bench) -> None:
+    both = ask(bench, "anything", "anything")
+    assert (both.success, both.simultaneous) == (True, True), both.message
+    assert {answer.label for answer in both.results} == {"red", "blue"}
+    alone = ask(bench, "red", "red")
+    assert [answer.code for answer in alone.results] == ["OK", "UNKNOWN_OBJECT"], alone.message
+    assert (alone.outcome, alone.simultaneous) == ("PARTIAL", False)
 
 
 @pytest.mark.requirement("P-01", "P-21")
