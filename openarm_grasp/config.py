@@ -252,6 +252,9 @@ class PushConfig(Config):
     )
     directions: int = Field(default=12, ge=1, le=72, description="directions of a push that are tried")
     gap: float = Field(default=0.012, ge=0.005, le=0.05, description="hand to object before it is pushed, m")
+    velocity_scale: float = Field(
+        default=0.25, gt=0.0, le=1.0, description="share of the speed of other motions, so that nothing slides on"
+    )
     tilts_deg: tuple[float, ...] = Field(
         default=(0.0, 15.0, 30.0, 45.0, 60.0), description="leans of the pushing hand from vertical, deg"
     )
@@ -340,7 +343,7 @@ class GraspConfig(Config):
         default_factory=table_camera, description="that the detections come from; named by the drift alarm"
     )
     velocity_scale: float = Field(
-        default=1.0, ge=0.0, le=1.0, description="of the motion limits; 0 = the planner's default"
+        default=1.0, ge=0.001, le=1.0, description="share of the limits of the joints, where a request has none"
     )
     sampler: str = Field(
         default="auto",

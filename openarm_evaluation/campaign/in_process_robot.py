@@ -164,7 +164,7 @@ class InProcessRobot:
             request.arm,
             approach_of(request),
             start,
-            self.velocity_scale,
+            self.velocity_scale * request.velocity_scale,
             boxes_of(request.ignore_regions),
         )
         answer = await self._asked(lambda stopped: self.robot.motion.plan_approach(asked, stopped))

@@ -30,6 +30,7 @@ class PlanGrasp:
         target: The object, as one box or several, base frame; the fingers may touch it, and it goes with the hand.
         ignore_regions: Where the object will not stand any more then: the map still shows it there.
         start: Joints that it starts from: of the lift, then of the arm, rad and m; empty: the present ones.
+        velocity_scale: Share of the speed of other motions.
     """
 
     arm: str
@@ -38,6 +39,7 @@ class PlanGrasp:
     target: tuple[Box, ...]
     ignore_regions: tuple[Box, ...] = ()
     start: tuple[float, ...] = ()
+    velocity_scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class PlanPlace:
         held: What the hand carries, as one box or several, TCP frame.
         after: Trajectory whose end is the start; None starts at the present joints.
         ignore_regions: Where the object stood: the map may not know yet that it was taken away.
+        velocity_scale: Share of the speed of other motions.
     """
 
     arm: str
@@ -56,6 +59,7 @@ class PlanPlace:
     held: tuple[Box, ...]
     after: Trajectory | None = None
     ignore_regions: tuple[Box, ...] = ()
+    velocity_scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,7 @@ class RobotInterface(Protocol):
     """Robot time after which `check` raises CANCELLED; 0: none."""
 
     velocity_scale: float
-    """Share of the limits of the joints that motions take; 0: the planner's default."""
+    """Share of the limits of the joints that motions take."""
 
     @property
     def now_ns(self) -> int:

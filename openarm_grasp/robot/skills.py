@@ -190,24 +190,25 @@ class Skills:
         gone = () if now is None else (target_box(now.target, config),)
         return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone, start))
 
-    async def plan_sweep(
+    async def plan_push(
         self,
         arm: str,
         ways: Sequence[GraspCandidate],
         found: Sighting,
-        heap: tuple[Box, ...],
+        pushed: tuple[Box, ...],
         under: tuple[Box, ...] = (),
     ) -> Planned:
-        """Plan a closed hand through several things that go with it.
+        """Plan a closed hand that pushes one thing, or several, slowly.
 
         Args:
             arm: Whose.
             ways: The candidates.
             found: What stands around them.
-            heap: Boxes about them, as far as the hand meets them.
+            pushed: Boxes about them, as far as the hand meets them.
             under: Boxes about all of them: what the map shows there is no obstacle.
         """
-        return await self.plan(PlanGrasp(arm, tuple(ways), neighbours(found, heap, self._config), heap, under))
+        others, speed = neighbours(found, pushed, self._config), self._config.push.velocity_scale
+        return await self.plan(PlanGrasp(arm, tuple(ways), others, pushed, under, velocity_scale=speed))
 
     async def plan_place(
         self,

@@ -213,7 +213,7 @@ class GraphRobot:
     # --- planning and moving
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Ask /motion/plan_approach."""
-        goal = messages.plan_goal(request, self.velocity_scale)
+        goal = messages.plan_goal(request, self.velocity_scale * request.velocity_scale)
         what = f"{request.arm} arm: planning"
         result = await self._nodes.goal(self._plan, goal, self._config.limits.plan_timeout, what, self._watched(None))
         return messages.planned_from_msg(result, len(goal.targets))

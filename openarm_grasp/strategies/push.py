@@ -22,7 +22,7 @@ from openarm_common.wanted import EASIEST
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.perception.sightings import seen_at
-from openarm_grasp.planning.candidates import GraspCandidate, displaced
+from openarm_grasp.planning.candidates import GraspCandidate, displaced, target_boxes
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.planning.neighbours import cornered, crowded
 from openarm_grasp.planning.offers import offers
@@ -177,7 +177,7 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
             faults.append(f"{arm} hand: {found.target.label!r} is too thin for it, or would tip over")
             continue
         try:
-            plan = await robot.plan_grasp(arm, ways, found)
+            plan = await robot.plan_push(arm, ways, found, target_boxes(found.target, ways[0], config))
         except OpenArmError as error:
             if error.code not in NO_WAY:
                 raise

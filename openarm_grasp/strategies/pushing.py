@@ -97,7 +97,7 @@ async def plan_sweep(
                 faults.append(f"{arm} hand: what stands there is too thin for it")
                 continue
             try:
-                plan = await robot.plan_sweep(arm, ways, replace(found, others=sweep.rest), sweep.heap, sweep.under)
+                plan = await robot.plan_push(arm, ways, replace(found, others=sweep.rest), sweep.heap, sweep.under)
             except OpenArmError as error:
                 if error.code not in NO_WAY:
                     raise
