@@ -76,9 +76,14 @@ class Skills:
         """End the work after so many s of robot time; 0: no limit."""
         self.robot.deadline_ns = self.robot.now_ns + round(timeout * 1e9) if timeout > 0.0 else 0
 
-    def set_speed(self, scale: float) -> None:
-        """Let motions take a share of the limits of the joints; 0: that of the configuration."""
-        self.robot.velocity_scale = scale or self._config.velocity_scale
+    def set_speed(self, scale: float, failures: int = 0) -> None:
+        """Let motions take a share of the limits of the joints, half of it after each failure.
+
+        Args:
+            scale: The share; 0: that of the configuration.
+            failures: Attempts that have failed.
+        """
+        self.robot.velocity_scale = (scale or self._config.velocity_scale) * 0.5**failures
 
     def warn(self, text: str) -> None:
         """Report something that does not stop the work."""

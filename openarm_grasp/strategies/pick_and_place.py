@@ -130,6 +130,7 @@ async def _attempts(run: Run) -> GraspOutcome:
                 return succeeded(run, text, gripper=placed.gripper, camera=seen)
             run.failure = seen
         why = run.start_again(grasp, placed)
+        run.robot.set_speed(run.request.velocity_scale, run.tried)
 
 
 async def _see_where_it_is(run: Run) -> None:

@@ -30,6 +30,7 @@ def test_a_miss_opens_backs_off_and_tries_another_way(world):
     assert [type(e) for _, e in missed[3:7]] == [Grip, MoveLinear, GoHome, GoHome]  # pause, measure
     first, second = world.done(PlanGrasp)
     assert first.candidates[0].id not in {way.id for way in second.candidates}
+    assert world.velocity_scale == 0.5, "and more slowly"
 
 
 @pytest.mark.parametrize("sag", [0.012, 0.030])
