@@ -251,7 +251,7 @@ class RecordedRobot:
 
     async def _answer(self, call: Call, guard: Callable[[], None] | None = None) -> Any:
         faults: list[OpenArmError] = []
-        while self._tick < call.end:
+        while True:
             try:
                 if not faults:
                     self.check()
@@ -259,6 +259,8 @@ class RecordedRobot:
                         guard()
             except OpenArmError as error:
                 faults.append(error)
+            if self._tick >= call.end:
+                break
             await turn()
         if faults:
             raise faults[0]
