@@ -58,6 +58,7 @@ class ReportRow(CompareRow):
     placed: bool
     false_success: bool
     attempts: int
+    sim_s: float
 
 
 def read_lines(path: Path, kind: type[CompareRow]) -> tuple[list[dict[str, Any]], str]:

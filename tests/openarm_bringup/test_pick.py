@@ -15,7 +15,8 @@ from openarm_bringup.commands import connect, pick
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import Option
-from openarm_grasp.ros.client import GraspResult
+from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.ros.client import GraspResult, PairResult
 from tests.openarm_bringup.commands import record_of
 
 OPTIONS = (
@@ -139,7 +140,7 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     answers = [
         GraspResult(True, Code.OK, "placed", "SUCCESS", "cup", "left", 1, (0.2, 0.3, 0.4), 9.0, (0.3, 0.0, 0.42)),
         GraspResult(False, Code.TOO_WIDE, "190 mm", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0, (0.2, 0.1, 0.45)),
-        *[GraspResult(False, Code.UNKNOWN_OBJECT, "no more", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0)] * 2,
+        *[GraspResult(False, Code.UNKNOWN_OBJECT, "no more", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0)] * 3,
     ]
     asked: list[dict[str, Any]] = []
 
@@ -147,7 +148,13 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
         asked.append({"label": label, **more})
         return answers.pop(0)
 
+    def both(*requests: GraspRequest, **_: Any) -> PairResult:
+        results = tuple(answer(**vars(request)) for request in requests)
+        code = next((one.code for one in results if not one.success), Code.OK)
+        return PairResult(False, code, "", "PARTIAL", True, results, 9.0)
+
     monkeypatch.setattr(client, "pick", answer)
+    monkeypatch.setattr(client, "pick_two", both, raising=False)
     bins = tmp_path / "bins.yaml"
     bins.write_text("bins: {tray: {x: [0.15, 0.25], y: [0.2, 0.44]}}\nrest: tray\n")
     outcome = pick.order("anything", bins=bins)
@@ -156,7 +163,7 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     assert outcome.text == "left: anything at (0.200, 0.100) m: TOO_WIDE: 190 mm\n"
     data = json.loads(json.dumps(outcome.data, allow_nan=False))
     assert data["left"][0]["where"] == [0.2, 0.1]
-    assert [row["place"] for row in data["results"]] == [[0.2, 0.3, 0.4], *[None] * 3]
-    assert asked[0]["place_choices"] == ((0.2, 0.26), (0.2, 0.38))
-    assert asked[2]["exclude_near"] == ((0.2, 0.3), (0.2, 0.1))
-    assert (asked[3]["object_at"], asked[3]["phase"]) == ((0.2, 0.1), "aside")
+    assert [row["place"] for row in data["results"]] == [[0.2, 0.3, 0.4], *[None] * 4]
+    assert [one["place_choices"] for one in asked[:2]] == [((0.2, 0.26), (0.2, 0.38)), ((0.2, 0.38), (0.2, 0.26))]
+    assert [one["exclude_near"] for one in asked[2:4]] == [((0.2, 0.3), (0.2, 0.1))] * 2
+    assert (asked[4]["object_at"], asked[4]["phase"]) == ((0.2, 0.1), "aside")
