@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,6 @@ from openarm_common.types import Array
 from openarm_common.wanted import describe, select
 from openarm_grasp.config import DetectConfig
 
-if TYPE_CHECKING:
-    from scipy.spatial import KDTree
-
 #: An object that is chosen by its position is no farther from it than this, m.
 SAME_PLACE = 0.05
 #: Things nearer to each other than this may be parts of one, m.
@@ -38,8 +34,6 @@ _PART = 0.01
 _ON = 0.015
 #: Clouds of so many frames are enough.
 _CLOUDS = 3
-#: What lies this near to points of an object is a piece of it, m.
-_PIECE = 0.010
 #: Of an object that has not moved more than this share is seen where it was; of one that has by 5 mm, less.
 _MOST = 0.95
 #: What stands on another thing, or in it, begins so much higher than that, m.
@@ -95,6 +89,30 @@ class UntrustedError(OpenArmError):
     def __init__(self, code: Code, message: str, where: Array) -> None:
         super().__init__(code, message)
         self.where = where
+
+
+class Ids:
+    """Ids for detections of a detector that follows nothing: that of the nearest one of its label before.
+
+    Args:
+        radius: Greatest distance between two sights of one object, m.
+    """
+
+    def __init__(self, radius: float) -> None:
+        self._radius = radius
+        self._known: dict[str, Detection] = {}
+
+    def given(self, frame: Frame) -> Frame:
+        """Return a frame with an id for each detection; one that its detector has given stays."""
+        free, named = dict(self._known), list[Detection]()
+        for d in frame.detections:
+            alike = [name for name, known in free.items() if known.label == d.label and apart(d, known) <= self._radius]
+            name = d.id or min(alike, key=lambda name: apart(d, free[name]), default=f"~{len(self._known)}")
+            free.pop(name, None)
+            named.append(d if d.id else replace(d, id=name))
+            if not d.id:
+                self._known[name] = named[-1]
+        return replace(frame, detections=tuple(named))
 
 
 def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Frame, ...]:
@@ -196,12 +214,12 @@ def find(
     exclude_parts: Sequence[Array] = (),
     same: Sighting | None = None,
 ) -> Sighting:
-    """Follow one object through all frames and average it.
+    """Choose an object, follow it by its id through all frames, and average it.
 
     Args:
-        frames: At least one, oldest first.
+        frames: At least one, oldest first; every detection has an id.
         label: What to look for, in words; "" takes any. Of those that fit, the first is taken.
-        limits: How near detections must be to be one object, and how much it may seem to move.
+        limits: How much an object may seem to move.
         at: (x, y) where it stands, m; None: anywhere.
         exclude_near: (x, y) of objects that are excluded, m.
         exclude_parts: (n, 2) where points of others are that are excluded, m.
@@ -215,91 +233,72 @@ def find(
             thirds of all, or moved between them.
     """
     anchor = _same(frames, same) if same else _anchor(in_view(frames, label), label, at, exclude_near, exclude_parts)
-    track, clouds = _track(frames, anchor, limits.match_radius, in_part=False)
-    if 3 * len(track) < 2 * len(frames):
-        parts, theirs = _track(frames, anchor, limits.match_radius, in_part=True)
-        if len(theirs) == len(parts):
-            track, clouds = parts, theirs
+    sights = [_Sight(d, _labelled(frame, d)) for frame in frames for d in frame.detections if d.id == anchor.id]
+    track, enough = [one for one in sights if one.shown.measured], 2 * len(frames)
+    if 3 * len(track) < enough:  # a part of something of unknown shape is taken on its points
+        parts = [one for one in sights if one.shown.measured or one.shown.in_part]
+        track = parts if all(one.cloud is not None for one in parts) else track
     if not anchor.measured and not (anchor.in_part and track):
         raise _not_measured(anchor)
-    # A detector may miss a thing in one frame; in most of them it must be in its place.
-    if 3 * len(track) < 2 * len(frames):
-        if clouds and _stays(frames, clouds[-1]):
-            return _sighting(frames[-1:], track[-1:], clouds[-1:], limits)
-        blurred = [f for f in frames if any(not d.measured and _same_thing(d, anchor) for d in f.detections)]
-        if 3 * (len(track) + len(blurred)) >= 2 * len(frames):
-            raise _not_measured(anchor)
-        raise UntrustedError(
-            Code.STALE_DATA,
-            f"{anchor.label!r} is in the same place in {len(track)} of {len(frames)} frames only: expected one within"
-            f" {limits.match_radius * 1e3:.0f} mm of {_text(anchor.p_base)} in two thirds of them",
-            anchor.p_base,
-        )
-    prism = all(d.kind for d in track) or len(clouds) < len(track)
-    if not prism:
-        # the box around what is no prism changes with the noise, the middle of its points hardly does; and in some
-        # frame a part of it may be missing
-        spots = np.array([cloud.points[cloud.labels == 1].mean(axis=0, dtype=np.float64) for cloud in clouds])
+    prism = all(one.shown.kind for one in track) or any(one.cloud is None for one in track)
+    # the box around what is no prism changes with the noise, the middle of its points hardly does
+    spots = np.array([one.shown.p_base if prism else one.middle for one in track])
+    if not prism:  # in some frame a part of it may be missing
         alike = np.linalg.norm(spots - np.median(spots, axis=0), axis=1) <= limits.shape_agrees_within
         if 3 * np.count_nonzero(alike) >= 2 * len(track):
-            kept = np.flatnonzero(alike)
-            track, clouds, spots = [track[k] for k in kept], [clouds[k] for k in kept], spots[kept]
-    else:
-        spots = np.array([d.p_base for d in track])
+            track, spots = [track[k] for k in np.flatnonzero(alike)], spots[alike]
     limit = limits.agree_within if prism else 2.0 * limits.shape_agrees_within
-    steps = [float(np.linalg.norm(a - b)) for a, b in pairwise(spots)]
-    if steps and max(steps) > limit:
-        if not prism and _stays(frames, clouds[-1]):
-            return _sighting(frames[-1:], track[-1:], clouds[-1:], limits)
-        raise UntrustedError(
-            Code.STALE_DATA,
-            f"{anchor.label!r} moved {max(steps) * 1e3:.1f} mm between two frames, expected at most"
-            f" {limit * 1e3:.1f} mm; is it at rest?",
-            anchor.p_base,
-        )
-    return _sighting(frames, track, clouds, limits)
+    step = max((float(np.linalg.norm(a - b)) for a, b in pairwise(spots)), default=0.0)
+    # A detector may miss a thing in one frame; in most of them it must be in its place.
+    if 3 * len(track) >= enough and step <= limit:
+        return _sighting(frames, track)
+    newest = next((one for one in reversed(track) if one.cloud is not None), None)
+    if newest is not None and newest.cloud is not None and _stays(frames, newest.cloud):
+        return _sighting(frames[-1:], [newest])
+    if 3 * len(track) >= enough:
+        text = f"moved {step * 1e3:.1f} mm between two frames, expected at most {limit * 1e3:.1f} mm; is it at rest?"
+    elif 3 * len(sights) >= enough:
+        raise _not_measured(anchor)
+    else:
+        text = f"is in view in {len(track)} of {len(frames)} frames only, expected in two thirds of them"
+    raise UntrustedError(Code.STALE_DATA, f"{anchor.label!r} at {_text(anchor.p_base)} {text}", anchor.p_base)
 
 
-def _tree(points: NDArray[np.floating]) -> KDTree:
-    from scipy.spatial import KDTree  # a client of the grasp node needs the types of this module alone
+@dataclass(frozen=True)
+class _Sight:
+    """An object in a frame, with its points labelled 1, where they are known."""
 
-    return KDTree(points)
+    shown: Detection
+    cloud: LabelledCloud | None
 
-
-def _sighting(
-    frames: Sequence[Frame], track: Sequence[Detection], clouds: Sequence[LabelledCloud], limits: DetectConfig
-) -> Sighting:
-    """The mean of sights of one object, and what else is in view."""
-    target = average(track)
-    mine = [cloud.points[cloud.labels == 1] for cloud in clouds[-_CLOUDS:]]
-    shape = _tree(np.concatenate(mine)) if mine else None
-    others = _others(frames, target, limits.match_radius, shape)
-    return Sighting(target, others, frames[-1].t_ns, tuple(clouds[-_CLOUDS:]))
+    @property
+    def middle(self) -> Array:
+        """(3,) mean of its points."""
+        points = self.cloud.points[self.cloud.labels == 1] if self.cloud is not None else np.empty((0, 3))
+        return np.asarray(points.mean(axis=0, dtype=np.float64), dtype=np.float64)
 
 
-def _track(
-    frames: Sequence[Frame], anchor: Detection, radius: float, *, in_part: bool
-) -> tuple[list[Detection], list[LabelledCloud]]:
-    """The sights of one object, and their clouds; with `in_part` those that show a part of it, too."""
-    track: list[Detection] = []
-    clouds: list[LabelledCloud] = []
-    for frame in frames:
-        fit = [d for d in frame.detections if d.label == anchor.label and (d.measured or (in_part and d.in_part))]
-        near = [d for d in fit if _distance(d, anchor) <= radius]
-        if not near:
-            continue
-        track.append(min(near, key=lambda d: _distance(d, anchor)))
-        mine = _labelled(frame, track[-1])
-        clouds += [mine] if mine is not None else []
-    return track, clouds
+def _sighting(frames: Sequence[Frame], track: Sequence[_Sight]) -> Sighting:
+    """The mean of sights of one object, and the newest sight of everything else in view."""
+    target, others = average([one.shown for one in track]), dict[str, Detection]()
+    for d in (d for frame in reversed(frames) for d in frame.detections):
+        if _whole(d) != _whole(target):
+            others.setdefault(d.id, d)
+    clouds = tuple(one.cloud for one in track if one.cloud is not None)
+    return Sighting(target, tuple(others.values()), frames[-1].t_ns, clouds[-_CLOUDS:])
+
+
+def _whole(d: Detection) -> str:
+    """Id of the object of which a detection may be a piece."""
+    return d.id.partition(".")[0]
 
 
 def _stays(frames: Sequence[Frame], cloud: LabelledCloud) -> bool:
-    """Whether what the newest frame shows of an object is there in two thirds of all, be it as a part of others.
+    """Whether what a frame shows of an object is there in two thirds of all, be it as a part of others.
 
     Things that touch are one in some frames and several in others, and none of them has moved.
     """
-    from openarm_world.shares import explain, view_of  # as of `_tree`
+    from openarm_world.shares import explain, view_of  # a client of the grasp node needs the types of this module alone
 
     mine = cloud.points[cloud.labels == 1].astype(np.float64)
     views = (view_of(frame.cloud.points, frame.cloud.camera) for frame in frames if frame.cloud is not None)
@@ -318,17 +317,13 @@ def _labelled(frame: Frame, detection: Detection) -> LabelledCloud | None:
 
 
 def _same(frames: Sequence[Frame], before: Sighting) -> Detection:
-    """The detection of an object that was seen before: its like that is nearest to it, and was not there next to it."""
-    target, newest = before.target, frames[-1].detections
-    alike = [d for d in newest if d.label == target.label]
-    for twin in (d for d in before.others if d.label == target.label):
-        stays = min(alike, key=lambda d: apart(d, twin), default=None)
-        if stays is not None and apart(stays, twin) <= min(SAME_PLACE, apart(stays, target)):
-            alike.remove(stays)
+    """The detection of an object that was seen before; when it was lost, the nearest like it that was not there."""
+    target, newest, known = before.target, frames[-1].detections, {d.id for d in before.others}
+    alike = [d for d in newest if d.label == target.label and d.id not in known]
     if not alike:
         text = f"{target.label!r} that was at {_text(target.p_base)} is not in view; in view: {describe(newest)}"
         raise OpenArmError(Code.UNKNOWN_OBJECT, text)
-    return min(alike, key=lambda d: (not d.measured, apart(d, target)))
+    return min(alike, key=lambda d: (d.id != target.id, not d.measured, apart(d, target)))
 
 
 def _anchor(
@@ -382,10 +377,6 @@ def _of_it(d: Detection, points: Array) -> bool:
     )
 
 
-def _same_thing(a: Detection, b: Detection) -> bool:
-    return a.label == b.label and apart(a, b) <= SAME_PLACE
-
-
 def _not_measured(d: Detection) -> UntrustedError:
     why = _WHY.get(d.code, "cannot be measured: something hides its outline, or the border of the image cuts it")
     return UntrustedError(d.code, f"{d.label!r} is in view at about {_text(d.p_base)}, but {why}", d.p_base)
@@ -423,29 +414,6 @@ def on_table(d: Detection, table_z: float, *, reach: float = 0.01) -> Detection:
     T = d.T_base_object.copy()
     T[2, 3] = table_z + height / 2.0
     return replace(d, T_base_object=T, size=np.array([d.size[0], d.size[1], height]))
-
-
-def _others(
-    frames: Sequence[Frame], target: Detection, match_radius: float, shape: KDTree | None
-) -> tuple[Detection, ...]:
-    """Everything but the target; what lies on its points (`shape`) is a piece of it that was cut off in one frame."""
-    found: list[Detection] = []
-    for frame in reversed(frames):
-        for number, d in enumerate(frame.detections, start=1):
-            if shape is not None and frame.cloud is not None:
-                points = frame.cloud.points[frame.cloud.labels == number]
-                if len(points) and np.mean(shape.query(points)[0] <= _PIECE) > 0.5:
-                    continue
-            # The middle of what is seen of an object may lie near another one.
-            rivals = (k for k in (target, *found) if k.label == d.label or (k.measured and d.measured))
-            rivals = (k for k in rivals if not stacked(k, d))
-            if all(apart(d, known) > match_radius for known in rivals):
-                found.append(d)
-    return tuple(found)
-
-
-def _distance(a: Detection, b: Detection) -> float:
-    return float(np.linalg.norm(a.p_base - b.p_base))
 
 
 def distance_to(d: Detection, p: Sequence[float] | Array) -> float:

@@ -113,7 +113,7 @@ def divided(found: Sighting, left: NDArray[np.bool_]) -> Sighting:
             clouds.append(replace(cloud, labels=labels))
     points, whole = object_points(found.clouds), (found.target,)
     target, rest = (_about(found.target, part, whole) for part in (points[~left], points[left]))
-    return replace(found, target=target, others=(*found.others, rest), clouds=tuple(clouds))
+    return replace(found, target=target, others=(*found.others, replace(rest, id="")), clouds=tuple(clouds))
 
 
 def _about(like: Detection, points: Array, whole: Sequence[Detection]) -> Detection:

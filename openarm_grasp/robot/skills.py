@@ -8,6 +8,7 @@ does not succeed.
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
 from math import inf
 from typing import Literal
 
@@ -21,7 +22,7 @@ from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
 from openarm_grasp.evidence.verdicts import Evidence, learn_command
-from openarm_grasp.perception.detections import Frame, Sighting, in_base
+from openarm_grasp.perception.detections import Frame, Ids, Sighting, in_base
 from openarm_grasp.planning.candidates import (
     UP,
     Box,
@@ -54,12 +55,16 @@ class Skills:
         robot: Interface to it.
         config: Parameters.
         arms: Those that may be sent home; none named: all.
+        ids: Ids of objects of detectors that give none; None: those of a new robot.
     """
 
-    def __init__(self, robot: RobotInterface, config: GraspConfig, *, arms: Sequence[str] = ()) -> None:
+    def __init__(
+        self, robot: RobotInterface, config: GraspConfig, *, arms: Sequence[str] = (), ids: Ids | None = None
+    ) -> None:
         self.robot = robot
         self._config = config
         self._arms = frozenset(arms or robot.description.arm_names)
+        self.ids, self._near_ids = ids or Ids(config.detect.match_radius), Ids(config.detect.match_radius)
         self._hands = {arm: HandReader(robot.description, robot.states, arm) for arm in robot.description.arm_names}
 
     @property
@@ -107,7 +112,8 @@ class Skills:
     async def observe(self, count: int, *, near: str = "") -> Frames:
         """Frames of detections that are taken from now on, by the camera over the table, or by one on a hand."""
         self.robot.check()
-        return await self.robot.observe(count, near=near)
+        seen, ids = await self.robot.observe(count, near=near), self._near_ids if near else self.ids
+        return replace(seen, frames=tuple(map(ids.given, seen.frames)))
 
     def expect_near(self, camera: str) -> None:
         """Announce an observation by the camera on the hand."""

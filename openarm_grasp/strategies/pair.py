@@ -16,7 +16,7 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import DetectConfig
-from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart, on_table
+from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, on_table
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome
 from openarm_grasp.requests.states import State
@@ -30,8 +30,6 @@ Requests = tuple[GraspRequest, GraspRequest]
 
 #: Places nearer to each other than this are served one after the other, m.
 _APART = 0.20
-#: Detections nearer to each other than this are one object, m.
-_ONE = 0.005
 #: Pairs of objects that are tried where words fit several.
 _TRIED = 4
 #: These end a request, and one that runs concurrently; no other strategy is tried.
@@ -130,7 +128,8 @@ async def simultaneous(pair: Pair) -> PairOutcome | None:
 
     async def work(i: int) -> None:
         arm = arms[i]
-        robot = Skills(coordinated(arm, pair.robots[arm], coordination, config), config, arms=(arm,))
+        own = coordinated(arm, pair.robots[arm], coordination, config)
+        robot = Skills(own, config, arms=(arm,), ids=pair.robot.ids)
         try:
             task = pair.task(i, robot, arm=arm, why=pair.reason)
             outcome = await pick_and_place(task, task.request)
@@ -227,7 +226,7 @@ def _pairs(requests: Requests, frames: Sequence[Frame], limits: DetectConfig) ->
         OpenArmError: As `GraspRequest.find`; UNKNOWN_OBJECT, when both requests fit one object alone.
     """
     first, second = (request.find(frames, limits) for request in requests)
-    if apart(first.target, second.target) <= _ONE:
+    if first.target.id == second.target.id:
         others = [request.without(_spot(first)) for request in requests]
         try:
             second = others[1].find(frames, limits)

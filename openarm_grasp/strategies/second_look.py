@@ -60,7 +60,8 @@ def _seen_again(run: Run, grasp: Grasp, seen: Frames) -> Grasp:
     if not found.target.measured:
         raise OpenArmError(Code.NOTHING_DETECTED, "only a part of it is seen from there")
     before = grasp.sighting.target
-    target = on_table(found.target, before.bottom, reach=np.inf)  # from near, little of what it stands on is in view
+    # from near, little of what it stands on is in view
+    target = replace(on_table(found.target, before.bottom, reach=np.inf), id=before.id)
     # A box that is observed again may have its edges swapped.
     sighting = replace(grasp.sighting, target=target)
     ways = run.ways(grasp.arm, replace(sighting, clouds=()))

@@ -385,7 +385,7 @@ class World(Skills):
         self.objects["red"] = standing_at(self.objects["red"], self.objects["red"].p_base[:2] + way[:2])
 
     def frames(self, count: int) -> Frames:
-        seen = tuple(self.objects.values())
+        seen = tuple(replace(d, id=name) for name, d in self.objects.items())
         found = []
         for _ in range(count):
             self.pass_time(0.1)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.config import DetectConfig
-from openarm_grasp.perception.detections import Frame, average, find, in_base, on_table, sticks_out
+from openarm_grasp.perception.detections import Frame, Ids, average, find, in_base, on_table, sticks_out
 from openarm_grasp.perception.sightings import seen_at
 from tests.refusals import refused, refuses
 
@@ -25,12 +26,16 @@ def seen(label="red", x=0.26, y=-0.2, z=0.425, yaw=0.0, size=(0.04, 0.06, 0.05),
     return Detection(label, score, T, np.array(size), measured=score > 0.0)
 
 
-def frames(*detections: tuple[Detection, ...]) -> list[Frame]:
-    return [Frame(i * 100_000_000, d) for i, d in enumerate(detections)]
+def frames(*detections: tuple[Detection, ...], ids: Ids | None = None) -> list[Frame]:
+    return followed((Frame(i * 100_000_000, d) for i, d in enumerate(detections)), ids)
+
+
+def followed(seen: Iterable[Frame], ids: Ids | None = None) -> list[Frame]:
+    return list(map((ids or Ids(0.03)).given, seen))
 
 
 def look(seq, label="red", **kwargs):
-    return find(seq, label, DetectConfig(match_radius=0.03, agree_within=0.003), **kwargs)
+    return find(seq, label, DetectConfig(agree_within=0.003), **kwargs)
 
 
 def test_agreeing_frames_are_averaged_and_others_kept():
@@ -102,15 +107,15 @@ def test_what_is_known_of_an_object_outlives_the_average():
 @pytest.mark.requirement("R-18")
 def test_the_same_object_is_followed_wherever_it_is_and_not_its_twin():
     """The words would choose the other one; what stood next to it and still does is not it."""
-    a, b = seen(x=0.20), seen(x=0.32)
-    before = look(frames((a, b)))
+    a, b, ids = seen(x=0.20), seen(x=0.32), Ids(0.03)
+    before = look(frames((a, b), ids=ids))
     moved = seen(x=0.50)
-    assert look(frames((b, moved)), same=before).target.p_base[0] == pytest.approx(0.50)
-    assert look(frames((b, a)), same=before).target.p_base[0] == pytest.approx(0.20)
+    assert look(frames((b, moved), ids=ids), same=before).target.p_base[0] == pytest.approx(0.50)
+    assert look(frames((b, a), ids=ids), same=before).target.p_base[0] == pytest.approx(0.20)
     near = seen(x=0.28, y=-0.22)
-    assert look(frames((b, near)), same=before).target.p_base[0] == pytest.approx(0.28)
+    assert look(frames((b, near), ids=ids), same=before).target.p_base[0] == pytest.approx(0.28)
     with refuses(Code.UNKNOWN_OBJECT, r"'red' that was at .* is not in view; in view: red"):
-        look(frames((b,)), same=before)
+        look(frames((b,), ids=ids), same=before)
 
 
 @given(st.floats(-3.0, 3.0), st.integers(-2, 2))
@@ -240,31 +245,33 @@ def cloud_of(*detections: Detection) -> LabelledCloud:
 
 def test_a_part_of_something_of_unknown_shape_is_taken_on_its_points() -> None:
     part = seen("anything", score=0.0)
-    sighting = look([Frame(i, (part,), cloud_of(part)) for i in range(3)], "anything")
+    sighting = look(followed(Frame(i, (part,), cloud_of(part)) for i in range(3)), "anything")
     assert not sighting.target.measured
     assert len(sighting.clouds) == 3
     for one in (seen("red", score=0.0), replace(part, code=Code.TABLE_MISMATCH)):
-        assert refused(None, look, [Frame(i, (one,), cloud_of(one)) for i in range(3)], one.label).code is one.code
+        sights = followed(Frame(i, (one,), cloud_of(one)) for i in range(3))
+        assert refused(None, look, sights, one.label).code is one.code
     refused("cannot be measured", look, frames((part,), (part,), (part,)), "anything")
 
 
 def test_what_is_seen_whole_comes_before_what_is_seen_in_part() -> None:
     part, whole = seen("anything", score=0.0), seen("anything", x=0.4)
-    sighting = look([Frame(i, (part, whole), cloud_of(part, whole)) for i in range(3)], "anything")
+    sighting = look(followed(Frame(i, (part, whole), cloud_of(part, whole)) for i in range(3)), "anything")
     assert sighting.target.measured
     assert sighting.target.p_base[0] == pytest.approx(0.4)
 
 
 def test_what_a_frame_cut_off_is_whole_when_most_frames_show_all_of_it() -> None:
     part, whole = seen("anything", score=0.0), seen("anything")
-    sights = [Frame(i, (d,), cloud_of(d)) for i, d in enumerate((whole, whole, part))]
+    sights = followed(Frame(i, (d,), cloud_of(d)) for i, d in enumerate((whole, whole, part)))
     assert look(sights, "anything").target.measured
     assert not look(sights[1:], "anything").target.measured
 
 
 def test_a_sighting_elsewhere_has_its_points_there_and_those_of_others_where_they_are() -> None:
     one, other = seen("anything"), seen("anything", y=-0.4)
-    sighting = look([Frame(i, (one, other), cloud_of(one, other)) for i in range(3)], "anything", at=(0.26, -0.2))
+    sights = followed(Frame(i, (one, other), cloud_of(one, other)) for i in range(3))
+    sighting = look(sights, "anything", at=(0.26, -0.2))
     there = seen_at(sighting, (0.40, 0.1), np.pi / 2.0)
     assert there.target.p_base[:2] == pytest.approx((0.40, 0.1))
     for before, after in zip(sighting.clouds, there.clouds, strict=True):
@@ -281,7 +288,7 @@ def test_what_is_one_thing_in_some_frames_and_two_in_the_newest_is_taken_as_the_
     apart_now = cloud_of(one, other)
     together = replace(apart_now, labels=np.ones_like(apart_now.labels))
     older = [Frame(i, (both,), together) for i in range(2)]
-    sighting = look([*older, Frame(2, (one, other), apart_now)], "anything", at=(0.26, -0.2))
+    sighting = look(followed([*older, Frame(2, (one, other), apart_now)]), "anything", at=(0.26, -0.2))
     assert sighting.target.p_base[1] == pytest.approx(-0.2)
     assert sighting.target.size[1] == pytest.approx(0.06)
     (cloud,) = sighting.clouds
@@ -290,8 +297,8 @@ def test_what_is_one_thing_in_some_frames_and_two_in_the_newest_is_taken_as_the_
     # one that was not there before has come
     came = Frame(2, (one,), cloud_of(one))
     gone = [Frame(i, (other,), cloud_of(other)) for i in range(2)]
-    assert refused(None, look, [*gone, came], "anything").code is Code.STALE_DATA
+    assert refused(None, look, followed([*gone, came]), "anything").code is Code.STALE_DATA
     # and what slides is not two things
     slid = [seen("anything", y=-0.2 + 0.025 * i, size=(0.06, 0.06, 0.05)) for i in range(3)]
     with refuses(Code.STALE_DATA):
-        look([Frame(i, (d,), cloud_of(d)) for i, d in enumerate(slid)], "anything")
+        look(followed(Frame(i, (d,), cloud_of(d)) for i, d in enumerate(slid)), "anything")

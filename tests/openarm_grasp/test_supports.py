@@ -13,7 +13,7 @@ from openarm_common.errors import Code
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.perception.detections import Frame, Sighting, find, on_table
+from openarm_grasp.perception.detections import Frame, Ids, Sighting, find, on_table
 from openarm_grasp.perception.sightings import standing_at, surface_of
 from openarm_grasp.planning.candidates import propose, target_box
 from openarm_grasp.planning.neighbours import neighbours, under
@@ -109,7 +109,7 @@ def test_a_place_that_is_none_is_refused_with_what_is_in_view(others, name: str,
 def test_what_carries_an_object_is_another_one_and_not_beside_it():
     cube = thing("red", (0.3, 0.1, TABLE + 0.12), (0.045, 0.045, 0.045))
     next_to = thing("green", (0.4, 0.25, TABLE), (0.05, 0.05, 0.3))
-    frames = [Frame(k, (cube, BOX, next_to)) for k in range(3)]
+    frames = [Ids(0.03).given(Frame(k, (cube, BOX, next_to))) for k in range(3)]
     seen = find(frames, "red", CONFIG.detect)
     assert {one.label for one in seen.others} == {"blue", "green"}
     assert [one.label for one in seen.beside] == ["green"]

@@ -7,7 +7,7 @@ import pytest
 
 from openarm_common.errors import OpenArmError
 from openarm_grasp.config import DetectConfig
-from openarm_grasp.perception.detections import Frame, find
+from openarm_grasp.perception.detections import Frame, Ids, find
 from openarm_perception.detection.pipeline import Pipeline
 
 
@@ -52,7 +52,7 @@ def test_what_is_grasped_of_several_that_fit_follows_from_the_policy(tabletop, p
         tabletop.Thing("blue", "cylinder", (0.066, 0.066, 0.115), 0.305, 0.035),
     ]
     seen = tabletop.render(things).perceived(Pipeline(pipeline.detector, pipeline.localizer, policy))
-    assert find([Frame(0, seen.boxes)], "cube", DetectConfig()).target.label == first
+    assert find([Ids(0.03).given(Frame(0, seen.boxes))], "cube", DetectConfig()).target.label == first
 
 
 def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None:
