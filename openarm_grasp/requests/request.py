@@ -6,24 +6,21 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import LONGEST_TEXT, brief, check_length
-from openarm_common.types import Array
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
-from openarm_grasp.perception.detections import Frame, Sighting, find
+from openarm_grasp.perception.detections import Frame, Sighting, Spot, find
 from openarm_grasp.planning.arms import check_arm
 from openarm_grasp.requests.state_times import StateTime
 
 if TYPE_CHECKING:
     from openarm_grasp.planning.options import Option
 
-#: (x, y), base frame, m.
-Spot = tuple[float, float]
 #: Slowest motions, as a share of the limits of the joints.
 LEAST_SCALE = 0.001
 #: What to pick, and what to put it on or in.
@@ -49,7 +46,7 @@ class GraspRequest:
         velocity_scale: Share of the limits of the joints, 0.001 to 1; 0: that of the configuration.
         object_at: (x, y) near which the object is, base frame, m; None: any that is called so.
         exclude_near: (x, y) of objects that stay where they are, base frame, m.
-        exclude_parts: (n, 2) where points of others are that do, base frame, m.
+        placed: Ids of what was placed at some of these positions.
         place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
         why: What it is for, when it is a part of another request.
         same: The object, when an earlier part of the request was about it: as it was seen or left then.
@@ -67,7 +64,7 @@ class GraspRequest:
     velocity_scale: float = 0.0
     object_at: tuple[float, ...] | None = None
     exclude_near: tuple[Spot, ...] = ()
-    exclude_parts: tuple[Array, ...] = ()
+    placed: Mapping[Spot, str] = field(default_factory=dict[Spot, str])
     place_choices: tuple[Spot, ...] = ()
     why: str = ""
     same: Sighting | None = None
@@ -101,7 +98,7 @@ class GraspRequest:
             limits,
             at=self.object_at,
             exclude_near=self.exclude_near,
-            exclude_parts=self.exclude_parts,
+            placed=self.placed,
             same=self.same,
         )
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -31,8 +31,8 @@ from openarm_grasp.requests.states import State
 if TYPE_CHECKING:
     from openarm_grasp.robot.skills import Skills
 
-#: Objects whose places are remembered, and the edge of a cell of their points, m.
-_REMEMBERED, _CELL = 50, 0.01
+#: Objects whose places are remembered.
+_REMEMBERED = 50
 
 
 # --- what outlives a request
@@ -112,25 +112,22 @@ class GraspSession:
         self.drift = DriftWatch(context.config.drift, context.config.camera)
         #: What hands kept when their requests ended, by arm.
         self.kept: dict[str, Grasp] = {}
-        #: (x, y) of the newest objects that were placed, and where their points are (n, 2), m.
-        self._placed: list[tuple[Array, Array]] = []
+        #: (x, y) of the newest objects that were placed, and their ids.
+        self._placed: list[tuple[Array, str]] = []
 
-    def note_placed(self, position: Array, points: Array) -> None:
+    def note_placed(self, position: Array, name: str) -> None:
         """Remember where an object was placed, in place of what was placed there before.
 
         Args:
             position: (2,) or (3,) base frame, m.
-            points: (n, 3) of it, as far as known.
+            name: Its id.
         """
-        cells = np.unique(np.round(points[:, :2] / _CELL), axis=0) * _CELL
         kept = [one for one in self._placed if np.linalg.norm(one[0] - position[:2]) >= SAME_SPOT]
-        self._placed = [*kept[1 - _REMEMBERED :], (position[:2], cells)]
+        self._placed = [*kept[1 - _REMEMBERED :], (position[:2], name)]
 
-    def parts_of(self, stay: Sequence[Spot]) -> tuple[tuple[Spot, ...], tuple[Array, ...]]:
-        """Return positions at which nothing known was placed, and where points (n, 2) are of what was at others, m."""
-        placed = {q: [cells for p, cells in self._placed if len(cells) and math.dist(p, q) < SAME_SPOT] for q in stay}
-        known = {q: cells[-1] for q, cells in placed.items() if cells}
-        return tuple(q for q in stay if q not in known), tuple(known.values())
+    def placed_at(self, spots: Sequence[Spot]) -> Mapping[Spot, str]:
+        """Return the ids of what was placed at positions, of those where that is known."""
+        return {spot: name for spot in spots for p, name in self._placed if math.dist(p, spot) < SAME_SPOT}
 
     def check_hands(self, robot: Skills, request: GraspRequest) -> None:
         """Refuse what would drop an object that an ended request left in a hand; forget one that is gone.

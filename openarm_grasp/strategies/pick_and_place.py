@@ -124,8 +124,8 @@ async def _attempts(run: Run) -> GraspOutcome:
         if placed is not None and placed.failure is None:
             seen = await verify(run, grasp, placed, frames)
             if seen.ok:
-                points = se3.apply(grasp.motion_to(placed.target), object_points(grasp.sighting.clouds))
-                run.task.session.note_placed((run.place_target or placed.target).position, points)
+                position = (run.place_target or placed.target).position
+                run.task.session.note_placed(position, grasp.sighting.target.id)
                 text = f"{seen.reason}, placed by the {run.arm} arm"
                 return succeeded(run, text, gripper=placed.gripper, camera=seen)
             run.failure = seen
