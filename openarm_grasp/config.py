@@ -147,7 +147,10 @@ class DetectConfig(Config):
         default=5.0, gt=0.0, le=60.0, description="wait for the frames of one round, wall clock, s"
     )
     match_radius: float = Field(
-        default=0.03, gt=0.0, le=0.1, description="detections nearer than this are one object, m"
+        default=0.03,
+        gt=0.0,
+        le=0.1,
+        description="sights of one object are no farther apart where the detector gives no ids, m",
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -192,6 +193,8 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             withheld = self._watch.look(frame.t_ns, self._newest, self.table_height)
             perceived = self._pipeline.run(rgb, depth, intrinsics, posture.T_base_frame, robot, withheld, frame.t_ns)
             held = None if self._uncut else carriers(self.description, posture.joints, posture.held)
+            if not self._followed.t_ns:
+                self._followed = replace(self._followed, next_id=_first_id(frame.t_ns))
             self._followed, perceived, cloud = followed(
                 self._followed, perceived, self._newest, self._localizer.limits, frame.t_ns, held
             )
@@ -272,6 +275,11 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         message = f"frame {'skipped: pose of the camera at its stamp' if late else 'refused'}: {error.message}"
         self.get_logger().warning(message, throttle_duration_sec=5.0)
         self.diagnose(False, message, **self._counts)
+
+
+def _first_id(t_ns: int) -> int:
+    """Return the tenths of a second of the day: a detector that has started again gives no id of before."""
+    return 1 + t_ns // 100_000_000 % 864_000
 
 
 def main() -> None:

@@ -40,7 +40,7 @@ def test_a_box_is_found_where_it_stands(bench) -> None:
     assert message.header.frame_id == BASE_FRAME
     assert stamp_to_ns(message.header.stamp) % (200 * MS) == 0
     (found,) = message.detections
-    assert found.id == "1"
+    assert found.id.isdecimal()
     assert found.results[0].hypothesis.class_id == "red"
     assert 0.5 < found.results[0].hypothesis.score <= 1.0
     T = pose_to_matrix(found.bbox.center)
@@ -161,8 +161,17 @@ def test_boxes_in_the_image_by_their_centre_and_pictures_and_markers_for_people(
     assert (picture != bench.camera.rgb).any()
     wiped, body, text = markers.got[-1].markers
     assert (wiped.action, body.type, text.type) == (Marker.DELETEALL, Marker.CUBE, Marker.TEXT_VIEW_FACING)
-    assert re.fullmatch(r"red [01]\.\d\d #1", text.text)
-    assert box.id == "1"
+    assert re.fullmatch(rf"red [01]\.\d\d #{box.id}", text.text)
+
+
+def test_a_detector_that_was_started_again_gives_no_id_of_before(ros) -> None:
+    bench = Bench(ros, camera=FakeCamera(ros))
+    before = {d.id for d in bench.detect().detections}
+    assert {d.id for d in bench.detect().detections} == before
+    ros.executor.remove_node(bench.node)
+    again = Bench(ros, camera=bench.camera)
+    again.t_ns = bench.t_ns
+    assert before.isdisjoint(d.id for d in again.detect().detections)
 
 
 @pytest.mark.requirement("A-61")
