@@ -150,7 +150,7 @@ class DetectConfig(Config):
         default=0.03,
         gt=0.0,
         le=0.1,
-        description="sights of one object are no farther apart where the detector gives no ids, m",
+        description="sights of one object, where its detector gives no ids, m",
     )
 
 
