@@ -18,7 +18,7 @@ def file_to_read(text: str, suffixes: Sequence[str], others: Mapping[str, str] =
     Args:
         text: The path; ~ is the node's home, and a relative path begins at its working directory.
         suffixes: Those that it may have, such as .bt.
-        others: What to do with a file of another suffix.
+        others: Advice for a file of another suffix.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for another suffix or kind of file.

@@ -82,12 +82,12 @@ def parse_yaml(text: str, where: str, code: Code = Code.CONFIG_INVALID) -> Any:
     """Parse YAML without aliases.
 
     Args:
-        text: At most 4 MiB.
+        text: Text of at most 4 MiB.
         where: Begins the error, such as the path of a file.
         code: Code of the error.
 
     Raises:
-        OpenArmError: With `code`, when it is not YAML, too long, or nested too deeply.
+        OpenArmError: `code`, when it is not YAML, too long, or nested too deeply.
     """
     if len(text) > MAX_YAML_BYTES:
         raise OpenArmError(code, f"{where} is longer than {MAX_YAML_BYTES // 2**20} MiB")
@@ -116,7 +116,7 @@ def read_text(path: Path, code: Code = Code.CONFIG_INVALID, most: int = MAX_YAML
         most: Longest file, bytes.
 
     Raises:
-        OpenArmError: With `code`, when the file is missing, longer, or not UTF-8.
+        OpenArmError: `code`, when the file is missing, longer, or not UTF-8.
     """
     try:
         with path.open("rb") as file:
@@ -138,7 +138,7 @@ def load_json(path: Path, code: Code = Code.INVALID_ARGUMENT) -> Any:
     """Read JSON.
 
     Raises:
-        OpenArmError: With `code`, as `read_text`, and when it is not JSON, or nested too deeply.
+        OpenArmError: `code`, same as `read_text`, and when it is not JSON, or nested too deeply.
     """
     return parse_json(read_text(path, code), str(path), code)
 
@@ -159,7 +159,7 @@ def load_yaml(path: Path, code: Code = Code.CONFIG_INVALID) -> dict[str, Any]:
         code: Code of the error.
 
     Raises:
-        OpenArmError: With `code`, when the file is missing, is not YAML, or is not a mapping; see `parse_yaml`.
+        OpenArmError: `code`, when the file is missing, is not YAML, or is not a mapping; see `parse_yaml`.
     """
     return _mapping(read_text(path, code), str(path), code)
 
@@ -186,7 +186,7 @@ def metres_by_name(items: Sequence[str], field: str, example: str, low: float, h
         high: Largest value, m.
 
     Raises:
-        ValueError: With what is wrong, for a validator of the model.
+        ValueError: The fault, for a validator of the model.
     """
     found: dict[str, float] = {}
     for item in items:
@@ -216,7 +216,7 @@ def validate(model: type[ConfigT], data: dict[str, Any], where: str, code: Code 
         code: Code of the error.
 
     Raises:
-        OpenArmError: With `code`, and `where`:key for each fault.
+        OpenArmError: `code`, and `where`:key for each fault.
     """
     try:
         return model.model_validate(data)
@@ -228,7 +228,7 @@ def describe_faults(error: ValidationError, where: str, model: type[BaseModel]) 
     """Turn a pydantic error into `where:key: fault` sentences, with the valid keys for an unknown one.
 
     Args:
-        error: What pydantic found.
+        error: Error of pydantic.
         where: Begins each fault.
         model: Model of the data.
     """

@@ -25,7 +25,7 @@ class Described:
     """What is known of an object besides where it is.
 
     Attributes:
-        name: What it is: a class of a network, a tag; empty when nothing says so.
+        name: Class of a network, or of a tag; empty when nothing says so.
         color: A colour of the palette; empty when it has none.
         kind: Shape: box, cube, cylinder, can, sphere; empty when it is not known.
     """
@@ -55,11 +55,11 @@ class Detection(Described):
     """One object in one image.
 
     Attributes:
-        name: As `Described`; so are `color` and `kind`.
+        name: Same as for `Described`; so are `color` and `kind`.
         score: Confidence, 0 to 1.
         T_base_object: (4, 4) pose of the centre of the box, yaw only, m.
         size: (3,) full edges, m.
-        round: Whether it is a circle seen from above: its yaw means nothing, and a hand may approach from any side.
+        round: True for a circle seen from above: its yaw means nothing, and a hand may approach from any side.
         measured: Whether the box is that of the object. If not, it encloses what is visible of the object: an obstacle,
             and a target only where nothing is known of the object but its points.
         code: Why it was not measured: NOTHING_DETECTED (hidden, or cut by the border of the image), or a mismatch.

@@ -15,8 +15,8 @@ def first_fit(what: str, way_out: str, draw: Callable[[], T | None], most: int =
     """Return the first draw that fits.
 
     Args:
-        what: That is drawn, by which seed, and what must hold for it.
-        way_out: What to change where nothing fits.
+        what: Description of what is drawn, by which seed, and of what must hold for it.
+        way_out: Advice on what to change where nothing fits.
         draw: Draws once; None: it does not fit.
         most: Draws.
 
@@ -34,8 +34,8 @@ def until(done: Callable[[], bool], what: str, way_out: str, most: int) -> Itera
 
     Args:
         done: Asked before each draw.
-        what: That is drawn.
-        way_out: What to change.
+        what: Description of what is drawn.
+        way_out: Advice on what to change.
         most: Draws.
     """
     for number in range(most):

@@ -96,7 +96,7 @@ class Answer:
     Attributes:
         success: The request was fulfilled.
         code: OK, or why not.
-        message: What happened, in a sentence or two.
+        message: A sentence or two on what happened.
     """
 
     success: bool
@@ -107,7 +107,7 @@ class Answer:
         """Return the answer where the request was fulfilled.
 
         Raises:
-            OpenArmError: With code and message, where it was not.
+            OpenArmError: The code and message, where it was not.
         """
         if not self.success:
             raise OpenArmError(self.code, self.message)

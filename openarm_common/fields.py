@@ -38,7 +38,7 @@ def check_field(kind: str, value: Any, where: str) -> None:
 
     Args:
         kind: Type of the field, as messages name it.
-        value: In Python.
+        value: Value in Python.
         where: Path of the field, for the error.
 
     Raises:

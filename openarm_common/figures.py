@@ -77,7 +77,7 @@ def render_page(template: Path, **values: Any) -> str:
 
     Args:
         template: File of the template; it may include others of its folder.
-        values: By the names that the template uses.
+        values: Values by the names that the template uses.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 

@@ -64,11 +64,11 @@ class Watched:
     """A process that is watched by its lifeline, in a thread.
 
     Args:
-        connection: To the lifeline.
+        connection: Connection to the lifeline.
         on_end: Called once when it ends, unless `close` was called before.
 
     Attributes:
-        ended: Whether it has.
+        ended: True once it has ended.
     """
 
     def __init__(self, connection: socket.socket, on_end: Callable[[], object]) -> None:

@@ -34,8 +34,8 @@ class Record(Config, ABC):
 
     Attributes:
         place: Folder of its kind below that of the calibrations.
-        noun: What it is called in messages.
-        command: What makes one.
+        noun: Name of a record in messages.
+        command: Command that makes one.
         usual: Name of the one that is meant where none is named.
     """
 

@@ -55,7 +55,7 @@ def write_whole(path: Path, data: bytes, code: Code = Code.ENVIRONMENT) -> None:
     """Write a file under another name, then rename it: a reader gets the old or the new one, never a part.
 
     Raises:
-        OpenArmError: With `code`, when it can't be written.
+        OpenArmError: `code`, when it can't be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -75,7 +75,7 @@ def select(text: str, detections: Sequence[Detection]) -> tuple[Detection, ...]:
 
     Args:
         text: Words; relations may follow each other. Without any, all are.
-        detections: What is in view, the first choice at the front.
+        detections: Objects in view, the first choice at the front.
 
     Returns:
         The best first, at least one: by the choice in the words, the distance to the object of a relation, or else in

@@ -138,7 +138,7 @@ class TrajectoryFollower(Follower):
         """Return the trajectory in the order of the joints.
 
         Raises:
-            TrajectoryError: As `openarm_control.trajectory.checked`.
+            TrajectoryError: Same as `openarm_control.trajectory.checked`.
         """
         return checked(trajectory, self.group)
 
@@ -159,7 +159,7 @@ class TrajectoryFollower(Follower):
         """Follow a checked trajectory from now on; one that runs is aborted, or the new one refused, as configured.
 
         Args:
-            trajectory: From `check`.
+            trajectory: Trajectory from `check`.
             t_ns: Present time.
             measured: (k,) present positions.
             done: Called once, from `update` or `start`, when the goal ends.

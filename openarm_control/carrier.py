@@ -56,10 +56,10 @@ class Carrier:
     """Makes servo targets of references, for one arm.
 
     Args:
-        servos: What is known of them.
-        config: How it carries.
-        load: What motions take; needed where servos leave weight to the client.
-        gains: Of the correction, as they are safe; needed there too.
+        servos: Servos, as far as known.
+        config: Settings of how it carries.
+        load: Torque that motions take; needed where servos leave weight to the client.
+        gains: Gains of the correction that are safe; needed there too.
     """
 
     def __init__(

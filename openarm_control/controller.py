@@ -94,10 +94,10 @@ class RobotController(JointController):
         arms: Joint group of each arm by side.
         grippers: Joint group (one finger joint) of each gripper by side.
         joint_names: Order of the joints, of states and of targets.
-        state: Where they are.
+        state: State of the joints.
         gripper_effort: Limit of each finger joint, N or N m, by side.
-        trajectory: How arms follow.
-        gripper: How grippers move.
+        trajectory: Settings of how arms follow.
+        gripper: Settings of how grippers move.
         carriers: Make servo targets of the command of each arm, by side.
     """
 
@@ -140,7 +140,7 @@ class RobotController(JointController):
         """Check a position command; names may be a part of the joints, in any order. May run in any thread.
 
         Raises:
-            OpenArmError: As `PositionCommand.checked`.
+            OpenArmError: Same as `PositionCommand.checked`.
         """
         return PositionCommand.checked(names, positions, self._limits)
 

@@ -77,7 +77,7 @@ class Follower(ABC):
 
     Args:
         group: The joints.
-        command: Where the command is.
+        command: Position of the command.
     """
 
     def __init__(self, group: JointGroup, command: Tracker) -> None:

@@ -145,7 +145,7 @@ class GripperFollower(Follower):
         """Follow a checked goal from now on; one that runs is aborted.
 
         Args:
-            goal: From `check`.
+            goal: Goal from `check`.
             position: Measured now.
             effort: Measured now.
             done: Called once, from `update` or `start`, when the goal ends.

@@ -73,8 +73,8 @@ def carriers(
 
     Args:
         description: The robot.
-        config: How it carries.
-        servos: What is known of them, by side.
+        config: Settings of how it carries.
+        servos: Servos by side, as far as known.
     """
     soft = any(one.soft for one in servos.values())
     loads = arm_loads(description) if soft else {}

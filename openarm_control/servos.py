@@ -93,14 +93,14 @@ class KnownServos:
     """The servos of both arms, as far as they are known.
 
     Args:
-        configured: By side; in use where nothing is stored.
+        configured: Servos by side; in use where nothing is stored.
         folder: Folder of the records; empty: the default one.
         dynamics_seed: Seed of the simulated robot that a record must be of; None: of a real one.
         warn: Called with why a record can't be used.
 
     Attributes:
-        models: By side.
-        sources: Where they come from, by side.
+        models: Models by side.
+        sources: Sources of the models, by side.
     """
 
     def __init__(

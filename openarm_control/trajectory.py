@@ -55,8 +55,7 @@ class JointGroup:
     """The joints of one controller; arrays (k,), rad or m, rad/s or m/s.
 
     Attributes:
-        lever: Of the joint of a gripper: what a finger moves when it does, m/m or m/rad; negative where it opens
-            downwards.
+        lever: Motion of a finger for that of the gripper's joint, m/m or m/rad; negative where it opens downwards.
     """
 
     names: tuple[str, ...]
@@ -87,8 +86,8 @@ class Trajectory:
         a: (n, k) accelerations, or None; used with velocities only.
         start_ns: Simulated time of the start; 0 is as soon as possible.
         path_tolerance: While moving.
-        goal_tolerance: At the end.
-        goal_time_s: How long after the end the goal may be reached; 0 is the controller's default, negative unbounded.
+        goal_tolerance: Tolerance at the end.
+        goal_time_s: Time after the end until the goal must be reached; 0: the controller's default, negative: unbounded.
     """
 
     names: tuple[str, ...]

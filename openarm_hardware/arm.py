@@ -57,11 +57,11 @@ class ArmMachine:
 
     Args:
         axes: Its motors.
-        settings: How they are commanded and watched.
+        settings: Settings of commands and limits.
         last: Positions by joint when they were last seen.
 
     Attributes:
-        phase: What it is doing.
+        phase: Phase of the arm.
         text: Why it waits, holds or sinks.
     """
 

@@ -29,7 +29,7 @@ class MotorAxis:
 
     Args:
         axis: Its wiring.
-        settings: How it is watched.
+        settings: Settings of its limits.
 
     Attributes:
         q, dq, tau: Of the joint, by the newest reply; NaN before one.
@@ -143,7 +143,7 @@ class MotorAxis:
         A motor that gets power reads a position within half a turn of its zero, wherever it is.
 
         Args:
-            last: Where the joint was last seen; None: nowhere.
+            last: Position at which the joint was last seen; None: nowhere.
         """
         axis, slack = self.axis, self._slack
         turns = {turn: (self._read + turn - axis.offset) / axis.ratio for turn in (0.0, math.tau, -math.tau)}

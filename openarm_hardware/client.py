@@ -48,11 +48,11 @@ class ServoProcess:
 
     Args:
         axes: All motors, in the order of the joints.
-        settings: How they are commanded and watched.
+        settings: Settings of commands and limits.
         last: Positions by joint when they were last seen.
 
     Attributes:
-        scheduling: How its process is scheduled.
+        scheduling: Scheduling of its process.
 
     Raises:
         OpenArmError: CONFIG_INVALID, for more motors than a bus carries at this rate; BUSY or ENVIRONMENT, when it

@@ -38,8 +38,8 @@ class MotorDriver:
 
     Args:
         servo: Commands the motors; may be exchanged for another one.
-        controller: Whose joints they are.
-        loads: Of the arms, by name.
+        controller: Controller of the joints.
+        loads: Loads of the arms, by name.
         guard: Refuses commands.
         publish: Called with each new joint state.
     """

@@ -46,10 +46,10 @@ class State:
         t_ns: Stamp of the newest replies, CLOCK_MONOTONIC.
         cycles: Since the start.
         late: Cycles that were left out, because the process was late.
-        phases: Of each arm.
+        phases: Phases of each arm.
         errors: Bus errors and frames that full queues took not.
         text: Why arms wait, hold or sink.
-        motors: In the order of the joints.
+        motors: Motors in the order of the joints.
         periods: Histogram of the time between two cycles, `BINS` of `BIN_S`.
     """
 
@@ -76,7 +76,7 @@ class Block:
 
     Args:
         memory: Shared.
-        at: Where the part begins.
+        at: Offset at which the part begins.
         size: Bytes of its content.
     """
 
@@ -120,8 +120,8 @@ class Exchange:
 
     Args:
         fd: Descriptor of the memory, as `make` returns it.
-        joints: How many there are.
-        arms: How many there are.
+        joints: Number of joints.
+        arms: Number of arms.
     """
 
     def __init__(self, fd: int, joints: int, arms: int) -> None:

@@ -35,10 +35,10 @@ class Jogged:
 
     Attributes:
         start, there, back: Of the joint, rad.
-        others: By so much another joint of the arm was off its place, at most, rad.
-        hottest: Of the motors, °C.
-        scheduling: How they were commanded.
-        turns: Which motors lost a turn, a sentence each.
+        others: Farthest that another joint of the arm was off its place, rad.
+        hottest: Temperature of the hottest motor, °C.
+        scheduling: Scheduling of the commands.
+        turns: Motors that lost a turn, a sentence each.
     """
 
     start: float
@@ -56,9 +56,9 @@ class Jog:
     Args:
         axes: The motors of the arm.
         joint: Its name.
-        load: Of the arm, whose weight is carried.
+        load: Load of the arm, whose weight is carried.
         guard: Refuses commands, of the joints of `axes`.
-        settings: How motors are commanded and watched.
+        settings: Settings of commands and limits.
     """
 
     def __init__(self, axes: Sequence[Axis], joint: str, load: ArmLoad, guard: TouchGuard, settings: Settings) -> None:

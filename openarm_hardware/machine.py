@@ -22,11 +22,11 @@ class Machine:
 
     Args:
         axes: All of them, in the order of the joints; those of an arm are on one bus.
-        settings: How they are commanded and watched.
+        settings: Settings of commands and limits.
         last: Positions by joint when they were last seen.
 
     Attributes:
-        arms: By name.
+        arms: Arms by name.
         buses: Address of the bus of each arm, in the order of `arms`.
     """
 
@@ -46,7 +46,7 @@ class Machine:
 
         Args:
             now_ns: Time, CLOCK_MONOTONIC.
-            received: What came from the bus of each arm since the last cycle.
+            received: Frames from the bus of each arm since the last cycle.
             command: The newest one of the client.
         """
         fresh = self._fresh(now_ns, command)

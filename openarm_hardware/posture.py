@@ -19,7 +19,7 @@ class LastPosture:
     """A file with the last positions of the joints of this process's robot.
 
     Args:
-        folder: Where it is; empty: that of calibrations.
+        folder: Folder of the file; empty: that of calibrations.
         name: Tells robots apart that are of one kind, such as an emulated one.
     """
 

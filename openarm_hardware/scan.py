@@ -28,12 +28,12 @@ class Found:
 
     Attributes:
         bus, id: Where it is.
-        reply_id: Of frames from it; 0 as it comes from the factory.
-        status: What its last reply says, in words.
+        reply_id: Id of frames from it; 0 as it comes from the factory.
+        status: Status in its last reply, in words.
         q: Position, rad of the motor; None where its ranges are not known.
-        celsius: Of MOSFET or rotor, whichever is hotter; None without a reply.
+        celsius: Temperature of MOSFET or rotor, whichever is hotter; None without a reply.
         mode: MIT, POS_VEL, VEL or POS_FORCE.
-        timeout_s: Of commands; 0: none.
+        timeout_s: Timeout of commands, s; 0: none.
         firmware: Register SW_VER, as text.
         ranges: ±rad, ±rad/s, ±N m.
     """
@@ -58,7 +58,7 @@ def scanned(buses: Sequence[str], wiring: Wiring) -> list[Found]:
         wiring: Wiring of the robot; says which kind of frames is sent.
 
     Raises:
-        OpenArmError: As `open_bus`; ENVIRONMENT, when a bus is lost meanwhile.
+        OpenArmError: Same as `open_bus`; ENVIRONMENT, when a bus is lost meanwhile.
     """
     found = list[Found]()
     for address in buses:

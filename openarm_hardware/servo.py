@@ -43,10 +43,10 @@ class Link:
 
     Args:
         address: Address of the bus.
-        flexible: As CAN FD.
+        flexible: Frames of CAN FD.
 
     Raises:
-        OpenArmError: As `open_bus`.
+        OpenArmError: Same as `open_bus`.
     """
 
     def __init__(self, address: str, *, flexible: bool) -> None:
@@ -93,7 +93,7 @@ class Ownership:
 
     Args:
         buses: Addresses.
-        takeover_s: For so long another process, whose client has died, may take to give them up.
+        takeover_s: Time that another process, whose client has died, may take to give them up.
 
     Raises:
         OpenArmError: BUSY, when another process has one and keeps it.
@@ -151,8 +151,8 @@ class Servo:
         machine: Decides what is sent.
         links: Bus of each arm, the same one of arms that share it.
         exchange: State and commands.
-        settings: As the machine's.
-        owner: Of the buses.
+        settings: Same as the machine's.
+        owner: Owner of the buses.
     """
 
     def __init__(

@@ -22,7 +22,7 @@ class TouchGuard:
     Links that are nearer than `KEEP` when arms begin to follow, as when one leans on the other, may part.
 
     Args:
-        checks: Of the robot, in the order of the joints of commands.
+        checks: Checks of the robot, in the order of the joints of commands.
     """
 
     def __init__(self, checks: SelfCollision) -> None:

@@ -35,9 +35,9 @@ class Zero:
 
     Attributes:
         joint: Its name.
-        before: Where the joint was said to be.
-        after: Where it is said to be now; None: it was not changed.
-        turned: By so much the motor's zero moves, rad of the motor.
+        before: Position that the joint was said to have.
+        after: Position that it is said to have now; None: it was not changed.
+        turned: Angle that the motor's zero moves by, rad of the motor.
         unit: Unit of the joint.
     """
 
@@ -127,7 +127,7 @@ def gains(axes: Sequence[Axis], *, flexible: bool) -> dict[str, dict[str, float]
     """Return the registers that say how motors behave, by joint.
 
     Raises:
-        OpenArmError: As `zeros`.
+        OpenArmError: Same as `zeros`.
     """
     found = dict[str, dict[str, float]]()
     for bus, mine in _buses(axes, flexible=flexible):

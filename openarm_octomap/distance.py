@@ -22,7 +22,7 @@ class DistanceTransform:
     Args:
         lattice: The box.
         reach: Distances are cut here, m.
-        unknown: What unknown cells count as.
+        unknown: State that unknown cells count as.
     """
 
     def __init__(self, lattice: Lattice, reach: float, unknown: UnknownPolicy = "free") -> None:

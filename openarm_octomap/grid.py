@@ -123,7 +123,7 @@ class OccupancyGrid:
 
         Args:
             shapes: The robot, base frame.
-            padding: In place of that of the shapes, m.
+            padding: Padding in place of that of the shapes, m.
         """
         changed, blocks = self.blocks.cell_set(), self.blocks
         where = (shapes.kinds, shapes.halves + padding, shapes.seen_from(np.eye(4)), self.lattice.resolution)

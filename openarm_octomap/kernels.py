@@ -59,7 +59,7 @@ def image_ends(
         far: Farthest valid depth, m.
         block: Edge in pixels of the blocks whose pixels must all lack a return for a ray to clear; 0: none clears.
         stride: Every so many columns and rows of such a block have a ray.
-        reach: How far such a ray clears, m.
+        reach: Range that such a ray clears, m.
         ray_x: (w,) x over z of each column.
         ray_y: (h,) y over z of each row.
         T: (3, 4) float32, camera in the frame of the map.
@@ -266,7 +266,7 @@ def walk_rays(
 
     Args:
         ends: (n, 3) cell indices relative to the box.
-        count: How many of them count.
+        count: Number of them that count.
         resolution: Edge of a cell, m.
         key_min: (3,) key of the first cell of the box.
         origin: (3,) where the rays begin, m.

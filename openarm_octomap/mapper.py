@@ -60,7 +60,7 @@ class Snapshot:
     """The map at one moment.
 
     Attributes:
-        lattice: Which cells.
+        lattice: Cells of the map.
         binary: Octree of states.
         full: Octree of log-odds, where it was wanted.
         states: (nx, ny, nz) copy, where it was wanted.
@@ -115,8 +115,8 @@ class Taken:
     """What became of a tree that replaced the map.
 
     Attributes:
-        nodes: Of the tree.
-        outside: How many of its leaves lie outside of the workspace, wholly or in part.
+        nodes: Nodes of the tree.
+        outside: Leaves that lie outside of the workspace, wholly or in part.
         text: A sentence that says so, and what was changed or left out.
     """
 
@@ -173,11 +173,11 @@ class Mapper:
         """Put the frames of one moment into the map.
 
         Args:
-            frames: At least one.
-            held: What the hands hold.
+            frames: Frames, at least one.
+            held: Boxes that the hands hold.
             distances: (nx, ny, nz), filled with the distance field; None leaves it out.
             wanted: "full" and "states", where the snapshot needs them.
-            edition: Of the map when the frames were taken: they are left out of a later one. None: of any.
+            edition: Edition of the map when the frames were taken: they are left out of a later one. None: of any.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, when frames are missing or lack a joint; the map is as it was.
@@ -286,7 +286,7 @@ class Mapper:
         Args:
             points: (n, 3), finite, m.
             resolution: Largest cell that may answer, m; 0 is the map's own.
-            unknown: What unknown cells count as, and so does what lies outside of the workspace.
+            unknown: State that unknown cells count as, and so does what lies outside of the workspace.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, for points that are not finite, or a resolution finer than the map's.

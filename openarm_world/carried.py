@@ -50,7 +50,7 @@ def carriers(description: RobotDescription, joints: Mapping[str, float], held: S
     Args:
         description: The robot.
         joints: Positions by joint name, rad or m.
-        held: What the hands hold; on links of the robot.
+        held: Boxes that the hands hold; on links of the robot.
     """
     return {box.name: Carrier(description.link_pose(box.link, joints) @ box.T_link_box, box.size) for box in held}
 
@@ -84,7 +84,7 @@ def gripped(
     """Return what carriers hold: what they have held, and a new one what is in its box.
 
     Args:
-        before: What each has held in the image before.
+        before: Grips of each in the image before.
         now: Carriers of this image, by the same names.
         bodies: All objects.
         least: Share of the points of an object that is in the box of what holds it.

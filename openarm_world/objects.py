@@ -70,11 +70,11 @@ class Objects:
     """All objects; a value.
 
     Attributes:
-        config: What counts as the same object.
+        config: Thresholds of what counts as the same object.
         tracks: The objects, oldest first.
         next_id: Number of the next one.
         t_ns: Stamp of the newest image.
-        grips: What each carrier holds, by its name.
+        grips: Grips of each carrier, by its name.
     """
 
     config: WorldConfig = field(default_factory=WorldConfig)
@@ -92,7 +92,7 @@ class Objects:
             view: Depth without the noise of single pixels.
             cloud: Points of the image in the base frame, and what was detected in it.
             t_ns: Stamp; one before the last (a world that was reset) forgets all objects.
-            carriers: What hands hold at this stamp, by name: objects in it move with it; None: not known.
+            carriers: Boxes of the hands at this stamp, by name: objects in one move with it; None: not known.
         """
         if t_ns < self.t_ns:
             return Objects(self.config, next_id=self.next_id).update(view, cloud, t_ns, carriers)

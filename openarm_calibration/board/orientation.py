@@ -18,7 +18,7 @@ def fronts(plane: Array, pixels: Array, rows: int, columns: int) -> list[Array]:
         plane: (n, 2) marks on the board, row by row.
         pixels: (n, 2) in the order of the finder, row by row.
         rows: Rows of marks.
-        columns: Of marks.
+        columns: Columns of marks.
     """
     grid = pixels.reshape(rows, columns, 2)
     grids = [grid, grid[::-1, ::-1], grid[::-1], grid[:, ::-1]]

@@ -38,7 +38,7 @@ class ServoLog:
     """Targets and positions of the joints of an arm, one row a period.
 
     Attributes:
-        period_s: From a row to the next.
+        period_s: Time from a row to the next, s.
         target: (n, k) that were sent at the times of the rows, and kept until the next, rad.
         position: (n, k) measured at those times, rad.
     """

@@ -23,7 +23,7 @@ def exported(item: StoredCalibration, form: str, *, optical: bool, child: str = 
 
     Args:
         item: Stored.
-        form: Of `FORMATS`.
+        form: One of `FORMATS`.
         optical: Whether the child frame is the optical one (z forward), not the camera's link (x forward).
         child: Its name; "": as of this suite's cameras.
         in_hand: Whether the camera moves with the arm.

@@ -203,7 +203,7 @@ def _marks(corners: Array, label: str, board: Board, lens: Lens) -> list[_View]:
     Args:
         corners: (m, 2), or (m, 3) with their numbers; NaN beyond those that there are.
         label: Label of the record.
-        board: Whose corners they are.
+        board: Board that the corners belong to.
         lens: Lens of the camera.
     """
     if corners.shape[1] == 3:

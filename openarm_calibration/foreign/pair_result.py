@@ -108,7 +108,7 @@ def pair_result(
         scale: Factor that the lengths of the board lack.
 
     Raises:
-        OpenArmError: As `solve_pairs`.
+        OpenArmError: Same as `solve_pairs`.
     """
     limits = limits or Limits()
     solution = solve_pairs(pairs, fixed)

@@ -81,7 +81,7 @@ def accuracy_of(samples: SampleSet, solution: Solution) -> Accuracy:
         solution: Mount.
 
     Raises:
-        OpenArmError: As `refine`.
+        OpenArmError: Same as `refine`.
     """
     part, now = solution.problem.subset(solution.used), solution.estimate
     noise, zeros = replace(now.noise, misfit=0.0), np.zeros(part.joints)
@@ -113,7 +113,7 @@ def accuracies(sessions: Sequence[SampleSet], result: ZerosResult) -> tuple[Accu
     """Return how wrong the mount and the hand of each session may be, with the zeros that were found in use.
 
     Args:
-        sessions: Whose views were solved, in the order of the boards.
+        sessions: Sessions whose views were solved, in the order of the boards.
         result: Zeros and mounts.
     """
     problem, estimate, covariance = result.solution.problem, result.solution.estimate, result.mounts_covariance()

@@ -58,10 +58,10 @@ class Cause:
 
     Args:
         name: One of `CAUSES`.
-        text: In a sentence, with the figure.
+        text: A sentence, with the figure.
         evidence: Twice the logarithm of the Bayes factor against input that is right; infinite where that has no
             answer at all.
-        translation: How far the mount moves when it is taken into account, m.
+        translation: Distance that the mount moves by when it is taken into account, m.
         rotation: The same, rad.
         score: Minus twice the log likelihood itself, by which causes are compared where `evidence` is infinite.
     """
@@ -116,7 +116,7 @@ def freed(problem: Problem, X: Array, Z: Array, noise: Noise) -> tuple[Estimate,
         problem: Views that the answer rests on.
         X: (cameras, 4, 4) to start from.
         Z: (boards, 4, 4) to start from.
-        noise: To start from.
+        noise: Noise to start from.
     """
     base = with_zeros(problem, fit_all(problem, X, Z, noise))
     out: dict[str, Freed] = {}

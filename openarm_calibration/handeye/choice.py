@@ -33,11 +33,11 @@ def solve_chosen(problem: Problem, config: SolveConfig | None = None) -> Solutio
     """Solve for the mounts of one camera and one board, with a misfit or without, as left-out poses have it.
 
     Args:
-        problem: At least three robot poses that differ in rotation about two axes.
-        config: How.
+        problem: Problem with at least three robot poses that differ in rotation about two axes.
+        config: Settings of the solver.
 
     Raises:
-        OpenArmError: As `solve`.
+        OpenArmError: Same as `solve`.
     """
     config = config or SolveConfig()
     solution = solve(problem, config)

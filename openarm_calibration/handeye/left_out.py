@@ -149,7 +149,7 @@ def closed_columns(problem: Problem, method: str) -> Array:
     """Return the rms errors (3,) of poses that a closed form did not see: px, m, rad; NaN where it has no answer.
 
     Args:
-        problem: Of one camera and one board.
+        problem: Problem with one camera and one board.
         method: Name of the closed form.
     """
     squares: list[Array] = []

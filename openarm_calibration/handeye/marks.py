@@ -190,7 +190,7 @@ def fit_poses(
         radii: (views,).
         poses: (views, 4, 4) to start from; kept where no step makes the residual smaller.
         intrinsics: (views, 4) or (views, 6).
-        iterations: At most.
+        iterations: Most iterations.
 
     Returns:
         (views, 4, 4) T_camera_board and (views,) sums of squared residuals, px².

@@ -44,7 +44,7 @@ class Motion:
     """How far the robot moved between its poses.
 
     Args:
-        poses: How many.
+        poses: Number of poses.
         rotation: Largest angle between two poses, rad.
         second: Largest angle between two poses about axes across the main one, rad.
         translation: Largest distance between two poses, m.
@@ -134,7 +134,7 @@ def require_accuracy(problem: Problem, estimate: Estimate, most_translation: flo
 
     Args:
         problem: The views.
-        estimate: Whose information and covariance have the cameras' mounts first.
+        estimate: Estimate whose information and covariance have the cameras' mounts first.
         most_translation: Largest standard deviation of a mount's position (of the vector), m.
         most_rotation: The same of its rotation, rad.
 

@@ -43,7 +43,7 @@ class Result:
         solution: The refinement, also where a closed form was asked for: the verdict rests on it.
         verdict: Grade and figures.
         methods: Every method compared with the refinement.
-        calibration: To be stored: of the method that was asked for.
+        calibration: Calibration to store: that of the method that was asked for.
     """
 
     solution: Solution
@@ -77,8 +77,8 @@ def calibrate(
     """Solve a session and judge it.
 
     Args:
-        samples: At least three poses that differ in rotation about two axes.
-        algorithm: What the stored mount is of; the refinement unless a comparison wants otherwise.
+        samples: Samples with at least three poses that differ in rotation about two axes.
+        algorithm: Algorithm of the stored mount; the refinement unless a comparison wants otherwise.
         config: Parameters of the solver.
         limits: Limits of the verdict.
         session: Hash of the session, for the record.
@@ -127,7 +127,7 @@ def judged(
         session: Hash of the session.
         created: When.
         stored: The calibration in use until now.
-        accuracy: Where zeros of the joints were solved for; None: determined by the samples.
+        accuracy: Accuracy of the arm, where zeros of the joints were solved for; None: determined by the samples.
     """
     problem = solution.problem
     before = None if stored is None else stored.T_parent_link @ T_LINK_OPTICAL
@@ -239,7 +239,7 @@ def calibrate_together(
         sessions: One for each camera.
         config: Parameters of the solver; without extras.
         limits: Limits of the verdicts.
-        hashes: Of the sessions, for the record; none, or one for each.
+        hashes: Hashes of the sessions, for the record; none, or one for each.
         created: When, as ISO 8601, for the record.
         stored: The calibrations in use until now, for the drift; none, or one for each.
         one_board: See `join`.
@@ -248,7 +248,7 @@ def calibrate_together(
         In the order of the sessions.
 
     Raises:
-        OpenArmError: As `join`; DEGENERATE, with cause and advice; INVALID_ARGUMENT, for extras.
+        OpenArmError: Same as `join`; DEGENERATE, with cause and advice; INVALID_ARGUMENT, for extras.
     """
     if config is not None and config.extras:
         raise OpenArmError(

@@ -63,12 +63,12 @@ class View:
         points: (n, 3) marks in the board frame, m.
         pixels: (n, 2) where they were detected.
         A: (4, 4) T_base_gripper at the stamp of the image, as the robot reports; not used when `fixed`.
-        setup: Which of camera and board the gripper carries.
+        setup: Which of camera and board the gripper carries: eye-in-hand or eye-to-hand.
         radius: Radius of the circles, m; 0 for corner points.
         camera: Index of the camera.
         board: Index of the board mount.
         pose: Number of the robot pose; views of the same one share its error.
-        name: What the view is called in reports.
+        name: Name of the view in reports.
         rate: (6,) how fast A changes, in its own six numbers a second; zero at rest.
         arm: The joints that A comes from, the same in all views; None where A alone is known.
     """
@@ -162,7 +162,7 @@ def assemble(views: Sequence[View], intrinsics: Sequence[Intrinsics], guesses: S
     """Make a problem of views.
 
     Args:
-        views: At least one.
+        views: Views, at least one.
         intrinsics: Intrinsics of each camera.
         guesses: (4, 4) T_camera_board of each view, near enough for least squares (see `detect.guess_pose`).
     """

@@ -135,9 +135,9 @@ def evidence(problem: Problem, linear: Linear, noise: Noise, extras: Sequence[Ex
 
     Args:
         problem: The views.
-        linear: At the answer.
+        linear: Linear system at the answer.
         noise: Standard deviations.
-        extras: That are free.
+        extras: Further unknowns that are free.
         priors: Priors of these; a constant is missing where one is infinite.
     """
     value = criterion(*linear.weighed(noise), max(noise.translation, FLOOR), max(noise.rotation, FLOOR))
@@ -183,7 +183,7 @@ def refine(
         estimate_robot: Whether the spread of the robot's errors is found from the data.
         estimate_px: Whether that of the marks follows the extras.
         estimate_misfit: Whether a misfit may be found, where the robot is.
-        iterations: At most.
+        iterations: Most iterations.
 
     Raises:
         OpenArmError: INTERNAL, when the start is no description of the views (a mark behind the camera).
@@ -318,12 +318,12 @@ def fit_all(
         problem: The views.
         X: (cameras, 4, 4) to start from.
         Z: (boards, 4, 4) to start from.
-        noise: To start from.
+        noise: Noise to start from.
         extras: More unknowns.
         priors: Priors of these.
 
     Raises:
-        OpenArmError: As `refine`.
+        OpenArmError: Same as `refine`.
     """
     start = replace(noise, translation=max(noise.translation, 1e-4), rotation=max(noise.rotation, 1e-4), misfit=0.0)
     return refine(problem, X, Z, start, extras=extras, priors=priors, estimate_robot=True, estimate_px=True)
@@ -338,7 +338,7 @@ def with_zeros(problem: Problem, known: Estimate, priors: Priors = FREE) -> Esti
 
     Args:
         problem: The views; without joint positions the answer is returned as it is.
-        known: With zeros as the robot reports them.
+        known: Answer with zeros as the robot reports them.
         priors: Priors of its extras.
     """
     best = start = known

@@ -51,7 +51,7 @@ def pose_tests(problem: Problem, used: Mask, estimate: Estimate, limit: float, u
     Args:
         problem: All views.
         used: (n,) which views the estimate rests on.
-        estimate: Of those.
+        estimate: Estimate from those views.
         limit: Largest distance that is usual.
         usable: (n,) views whose marks lie on a board; the others are not tested, their distance is infinite.
 
@@ -152,8 +152,8 @@ def solve_robustly(
     """Solve for all mounts of a problem, or refuse it; `solve.solve` also says what is wrong with the input.
 
     Args:
-        problem: At least three robot poses that differ in rotation about two axes.
-        config: How.
+        problem: Problem with at least three robot poses that differ in rotation about two axes.
+        config: Settings of the solver.
         priors: Priors of the extras.
         start: A solution of nearly the same problem, to start from; None: a closed form.
 

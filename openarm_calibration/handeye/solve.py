@@ -23,8 +23,8 @@ def solve(
     """Solve for all mounts of a problem.
 
     Args:
-        problem: At least three robot poses that differ in rotation about two axes.
-        config: How.
+        problem: Problem with at least three robot poses that differ in rotation about two axes.
+        config: Settings of the solver.
         priors: Priors of the extras.
         start: A solution of nearly the same problem, to start from; None: a closed form.
 

@@ -110,10 +110,10 @@ def search(
     """Search for the most likely spread of the robot, m and rad.
 
     Args:
-        full: As `criterion`.
-        KMK: As `criterion`.
-        both: As `criterion`.
-        start_t: Where to start, m.
+        full: Same as for `criterion`.
+        KMK: Same as for `criterion`.
+        both: Same as for `criterion`.
+        start_t: Translation to start from, m.
         start_r: The same, rad.
         whole: Whether to look everywhere, instead of near the start.
     """

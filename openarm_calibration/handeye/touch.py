@@ -80,7 +80,7 @@ def check_touches(
     Args:
         samples: Samples of a camera in the hand, with the robot at the zeros of its joints that are in use.
         solution: Solution of these samples.
-        touches: Of the same board in the same place, by any arm.
+        touches: Touches of the same board in the same place, by any arm.
         tip: (3,) in the frame of the hand's tool centre point.
         steady: Standard deviation of a touch, by axis.
 

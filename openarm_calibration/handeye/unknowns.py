@@ -25,10 +25,10 @@ class Noise:
     """Standard deviations by axis.
 
     Args:
-        px: Of a detected mark, pixels.
-        translation: Of the robot's pose, m; 0 is an exact robot.
-        rotation: Of the robot's pose, rad.
-        misfit: Of what the marks of a view have in common, over what `px` makes of it; 0 without.
+        px: Noise of a detected mark, pixels.
+        translation: Noise of the robot's pose, m; 0 is an exact robot.
+        rotation: Noise of the robot's pose, rad.
+        misfit: Noise that the marks of a view have in common, over what `px` makes of it; 0 without.
     """
 
     px: float
@@ -57,7 +57,7 @@ class Priors:
 
     Args:
         scale: Scale of the board.
-        delay: Of the images, s.
+        delay: Delay of the images, s.
         focal: Deviation of fx and fy, as a fraction.
         centre: Deviation of cx and cy, px.
         distortion: Deviation of k1 and of k2.
@@ -97,7 +97,7 @@ class Priors:
 
         Args:
             problem: The views.
-            extras: Which unknowns there are besides the mounts.
+            extras: Unknowns besides the mounts.
         """
         columns = layout(problem, extras)
         size = max(part.stop for part in columns.values())
@@ -131,7 +131,7 @@ class State:
         correction: (poses, 6) of the robot's poses.
         intrinsics: (cameras, 4) changes of fx, fy, cx, cy, px.
         scale: Scale of the board.
-        delay: Of the images, s.
+        delay: Delay of the images, s.
         distortion: (cameras, 2) k1, k2.
         zeros: (joints,) offsets of the joints; without them A is that of the view, rad.
     """
@@ -169,9 +169,9 @@ class Estimate(State):
     """Where the refinement ended.
 
     Args:
-        noise: That was used, or found.
+        noise: Noise that was used, or found.
         information: (parameters, parameters), columns as `problem.design`.
-        extras: Which of the unknowns besides the mounts were free.
+        extras: Unknowns besides the mounts that were free.
         spread: (parameters, parameters) covariance where the robot's spread was estimated.
         evidence: Minus twice the log marginal likelihood; comparable between answers for the same pixels whose extras
             have finite priors.
@@ -203,7 +203,7 @@ def values(problem: Problem, state: State, extras: Sequence[Extra]) -> Array:
     Args:
         problem: The views.
         state: The unknowns.
-        extras: Which ones.
+        extras: Unknowns besides the mounts.
     """
     columns = layout(problem, extras)
     out = np.zeros(max(part.stop for part in columns.values()))
@@ -235,7 +235,7 @@ class PoseTest:
     Args:
         distance: Squared distance by number of measurements, in units of what is expected (1 is usual).
         limit: Above it the pose contradicts the others.
-        influence: How far the answer moves without it, in standard deviations of the answer (Cook).
+        influence: Change of the answer without it, in standard deviations of the answer (Cook's distance).
         translation: Contradiction of the worst view, m at the board.
         rotation: The same, rad.
     """

@@ -40,7 +40,7 @@ class Check:
     """One criterion.
 
     Args:
-        name: What, in a word or two.
+        name: Name of the check, a word or two.
         ratio: Over its limit; above 1 is a warning, above 3 a failure.
         text: The figure in a sentence.
     """
@@ -77,7 +77,7 @@ def estimate_delay(samples: SampleSet, config: SolveConfig | None = None, rounds
     Args:
         samples: Samples of a moving robot.
         config: Parameters of the solver.
-        rounds: At most.
+        rounds: Most rounds.
     """
     config = config or SolveConfig(most_translation=0.1, most_rotation=0.2, reject_outliers=False)
     delay, sigma = 0.0, math.inf
@@ -207,8 +207,8 @@ def _focal(estimate: Estimate, stated: Intrinsics) -> tuple[float, float]:
     Of fx and fy the one farther off.
 
     Args:
-        estimate: With free intrinsics.
-        stated: Of the first camera.
+        estimate: Estimate with free intrinsics.
+        stated: Stated intrinsics of the first camera.
     """
     first = 6 * (len(estimate.X) + len(estimate.Z))
     sigma = np.sqrt(np.maximum(np.diag(estimate.covariance())[first : first + 2], 0.0))

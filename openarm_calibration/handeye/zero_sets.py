@@ -60,14 +60,14 @@ class ZerosCalibration:
     """Zeros of a robot, the mounts that go with them, and whether to believe them.
 
     Args:
-        result: Of the solver.
-        zeros: To be stored.
+        result: Result of the solver.
+        zeros: Zeros to store.
         cameras: Each session with the zeros that were found, judged.
         mounts: Mounts of the cameras, to be stored with them.
         before: Errors of left-out poses with the zeros of the description.
         after: The same with the zeros that were found.
         failures: Why they are not to be stored; none if they are.
-        warnings: What is doubtful.
+        warnings: Doubts, a sentence each.
     """
 
     result: ZerosResult
@@ -168,11 +168,11 @@ def calibrate_zeros(
         sessions: Sessions of one robot; any number of cameras and arms.
         config: Priors.
         limits: Limits of the verdicts.
-        hashes: Of the sessions, for the record.
+        hashes: Hashes of the sessions, for the record.
         created: When, as ISO 8601, for the record.
 
     Raises:
-        OpenArmError: As `arm_views` and `solve_zeros`.
+        OpenArmError: Same as `arm_views` and `solve_zeros`.
     """
     config = config or ZerosConfig()
     views, optics = arm_views(sessions)

@@ -148,7 +148,7 @@ def joints_of(description: RobotDescription, views: Sequence[ArmView]) -> tuple[
 
     Args:
         description: The robot.
-        views: At least one.
+        views: Views, at least one.
     """
     out: list[str] = []
     for base, tip in dict.fromkeys((view.base, view.tip) for view in views):
@@ -191,7 +191,7 @@ def arm_problem(
 
     Args:
         description: The robot.
-        views: At least one.
+        views: Views, at least one.
         intrinsics: Intrinsics of each camera.
         names: Names of the parameters, as in `ZerosResult`.
     """
@@ -218,7 +218,7 @@ def solve_zeros(
 
     Args:
         description: The robot, whose forward kinematics the reported positions are put through.
-        views: Of any number of sets: `View.camera` and `View.board` number the mounts, `View.pose` the robot poses.
+        views: Views of any sets: `View.camera` and `View.board` number the mounts, `View.pose` the robot poses.
         intrinsics: Intrinsics of each camera.
         config: Priors.
         start: A solution of nearly the same views, to start from.

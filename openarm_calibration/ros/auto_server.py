@@ -66,7 +66,7 @@ class AutoCalibrateServer:
     """Serves the action.
 
     Args:
-        node: That has the samples, the solver and the store.
+        node: Node that has the samples, the solver and the store.
     """
 
     def __init__(self, node: CalibrationNode) -> None:
@@ -215,7 +215,7 @@ class _Run:
         """Move to a posture.
 
         Raises:
-            OpenArmError: As /motion/move, or NOT_READY without it; CANCELLED, with the arm stopped.
+            OpenArmError: Same as /motion/move, or NOT_READY without it; CANCELLED, with the arm stopped.
         """
         if not await wait_until(self._node, self._mover.server_is_ready, _ANSWER):
             raise OpenArmError(Code.NOT_READY, "no action /motion/move: is the graph up (openarm up calibrate)?")

@@ -26,7 +26,7 @@ class ImageCapture:
     """Waits for an image that joint states come before and, if possible, after.
 
     Args:
-        node: That subscribes.
+        node: Node that subscribes.
         states: States of the robot; subscribed to only while an image is waited for.
         name: Name of the camera.
         config: Timeouts and the gate's window.
@@ -74,7 +74,7 @@ class ImageCapture:
         """Wait for the first frame with joint states before its stamp; its items are `image` and `camera_info`.
 
         Args:
-            after: How long after the image joint states are waited for, s.
+            after: Longest wait for joint states after the image, s.
 
         Raises:
             OpenArmError: NOT_READY, when no image comes in time; STALE_DATA, when no joint state comes at its stamp.
@@ -111,7 +111,7 @@ async def wait_until(node: BaseNode[Any], condition: Callable[[], bool], timeout
     """Wait, in a coroutine of the node, until a condition holds (True) or the time is over (False); s of wall clock.
 
     Args:
-        node: Whose executor runs the coroutine.
+        node: Node whose executor runs the coroutine.
         condition: Checked every 20 ms.
         timeout: s.
     """

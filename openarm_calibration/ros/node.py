@@ -54,7 +54,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
     Attributes:
         camera: The camera that is calibrated.
         samples: Samples of this camera, so far.
-        algorithm: What `compute_calibration` uses.
+        algorithm: Algorithm of `compute_calibration`.
         capture: Takes images of this camera.
     """
 

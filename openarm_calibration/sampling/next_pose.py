@@ -51,7 +51,7 @@ def visible(board: Board, T_camera_board: Array, optics: Intrinsics, margin: flo
     Args:
         board: The board.
         T_camera_board: (4, 4).
-        optics: Of the camera.
+        optics: Optics of the camera.
         margin: Kept from the edge of the image in addition to `EDGE`, px.
     """
     direction = T_camera_board[:3, 3] / max(float(np.linalg.norm(T_camera_board[:3, 3])), 1e-9)
@@ -214,7 +214,7 @@ class PoseSearch:
         Args:
             samples: So far.
             state: Joints as they are now; those that it lacks are taken as 0.
-            most: How many.
+            most: Most poses.
 
         Raises:
             OpenArmError: NOT_READY, when the position of the board is unknown; UNREACHABLE, when no posture shows it.

@@ -109,7 +109,7 @@ class SampleSet:
     """The samples of one session.
 
     Args:
-        head: What the session is about.
+        head: Subject of the session.
         description: The robot; its forward kinematics turn joints into poses.
         foreign: Whether the session file keeps the description, since no other reader has it.
     """
@@ -174,8 +174,8 @@ class SampleSet:
         Args:
             t_image_ns: Stamp of the image.
             matched: `gate.Matched`.
-            detection: Of the board in the image.
-            image: To keep, (h, w) grey.
+            detection: Detection of the board in the image.
+            image: Image to keep, (h, w) grey.
 
         Raises:
             OpenArmError: NOTHING_DETECTED, when the marks have no pose.
@@ -307,7 +307,7 @@ def head_of(
         parent: Link that carries it.
         description: The robot.
         optics: Intrinsics.
-        board: To detect.
+        board: Board to detect.
         carrier: Link that holds the board of a camera that does not move; "": the flange of the robot's last arm.
         more: Other fields.
     """

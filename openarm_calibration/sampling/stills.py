@@ -42,7 +42,7 @@ class Stretch:
 
     Args:
         stamps: Stamps of the images.
-        robot: At each, where the gate accepts them.
+        robot: Robot at each, where the gate accepts them.
         code: OK, or the gate's.
         reason: Why no image of it is taken, as far as is known; of the first image.
         sample: Name of the sample that was taken.

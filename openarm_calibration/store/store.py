@@ -179,7 +179,7 @@ def of_these_mounts(
     """Return the first calibration of a camera as it is mounted now, and why others that were met are not used.
 
     Args:
-        stores: As `places` lists them.
+        stores: Stores, from `places`.
         camera: Name of the camera.
         parent: Link that carries it.
         mount_seed: Seed of the simulated mounts in use.

@@ -60,7 +60,7 @@ class TableStore(RecordStore[StoredTable]):
         """Return the height of the table (m), where it is from, and what is wrong with what is stored.
 
         Args:
-            configured: What the scene says, m.
+            configured: Height that the scene states, m.
             mount_seed: Seed of the simulated mounts in use.
         """
         nominal = "of the scene"

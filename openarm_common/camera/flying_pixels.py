@@ -44,7 +44,7 @@ def label_flying(view: DepthView, config: FlyingConfig, label: Bytes) -> int:
 
     Args:
         view: The image; its intrinsics say how far apart neighbours are.
-        config: What counts as flying.
+        config: Thresholds of what counts as flying.
         label: (h, w), NOTHING_KNOWN is written where it is 0 and the pixel flies.
 
     Returns:
@@ -69,7 +69,7 @@ def label_lonely(
         far: Farthest valid depth, m.
         share: A neighbour is at the same depth z when it differs by less than share · z + noise · z², m/m.
         noise: 1/m.
-        neighbours: How many of the eight must be.
+        neighbours: Number of the eight that must be.
         label: (h, w), NOTHING_KNOWN is written over 0.
 
     Returns:

@@ -17,7 +17,7 @@ def mounted(cameras: Mapping[str, CameraConfig], mounts: Mapping[str, Array]) ->
     """Return the cameras, by name, at calibrated mounts.
 
     Args:
-        cameras: By name.
+        cameras: Cameras by name.
         mounts: T_parent_link (4, 4) by camera; those left out stay where they are.
     """
     moved = dict(cameras)

@@ -49,7 +49,7 @@ class Lens:
     Args:
         intrinsics: K and the size of the image.
         model: Name in `MODELS`, or none.
-        coefficients: In OpenCV's order.
+        coefficients: Coefficients in OpenCV's order.
     """
 
     intrinsics: Intrinsics

@@ -82,7 +82,7 @@ def _distortion(entries: Mapping[str, Any]) -> tuple[list[float], str]:
     """Return the coefficients and their model.
 
     Raises:
-        ValueError: For a projection that is neither a pinhole's nor a fisheye's.
+        ValueError: A projection that is neither a pinhole's nor a fisheye's.
     """
     projection = str(entries.get("camera_model", ""))
     fisheye = bool(entries.get("fisheye_model")) or _FISHEYE.search(projection) is not None
@@ -122,8 +122,8 @@ def _entries(document: Any, size: tuple[int, int] | None) -> dict[str, Any]:
     Of several cameras the one that is of this size.
 
     Raises:
-        TypeError: For a document without names.
-        ValueError: For several cameras.
+        TypeError: A document without names.
+        ValueError: Several cameras.
     """
     if isinstance(document, list):  # messages, as ROS prints them
         document = next(iter(cast("list[Any]", document)), None)

@@ -34,7 +34,7 @@ class Frame(Generic[T]):
         t_ns: The stamp.
         frame_id: Coordinate frame of the images.
         items: One of each stream, by its name.
-        posture: Of the robot and of the camera at the stamp; identity and no joints where none is tracked.
+        posture: Posture of the robot and of the camera at the stamp; identity and no joints where none is tracked.
     """
 
     t_ns: int
@@ -48,7 +48,7 @@ class FrameStream(Generic[T]):
 
     Args:
         streams: Names of the streams that make a frame.
-        tracker: Of the robot; None: frames need no posture.
+        tracker: Tracker of the robot; None: frames need no posture.
         frame_id: Coordinate frame that every item must have; empty: any.
         pose_of: Frame whose pose is looked up; empty: that of the items.
         joints: Whether the joints are needed.

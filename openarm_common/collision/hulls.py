@@ -21,7 +21,7 @@ class Hull:
         centre: (3,) middle of that box, in the frame of the points.
         corners: (n, 3) from there.
         triangles: (m, 3) faces, turned outwards.
-        rings: Of each corner, those that edges lead to.
+        rings: Corners that edges lead to, of each corner.
         planes: (m, 4) that touch it along its faces: outward normal, and minus its distance from the centre.
     """
 

@@ -15,7 +15,7 @@ class Axis:
         arm: Arm whose it is.
         bus: Address.
         id: Id of frames to it.
-        reply_id: Of frames from it.
+        reply_id: Id of frames from it.
         type: Type of the motor.
         ratio: Motor position by joint position; negative where they turn against each other.
         offset: Motor position where the joint is at 0, rad.

@@ -39,7 +39,7 @@ def pack(frame: Frame, *, flexible: bool) -> bytes:
 
     Args:
         frame: Id of 11 bits, at most 8 bytes of data.
-        flexible: As a frame of CAN FD with the faster data rate.
+        flexible: Frame of CAN FD with the faster data rate.
     """
     number, data = frame
     return _FLEXIBLE.pack(number, len(data), _RATE_SWITCH, data) if flexible else _CLASSIC.pack(number, len(data), data)
@@ -68,7 +68,7 @@ class Bus(ABC):
     """Carries frames.
 
     Attributes:
-        address: As it was opened.
+        address: Address that it was opened by.
         ignored: Frames that were received and are none of a motor's.
         errors: Error frames that were received.
         unsent: Frames that a full queue took not.

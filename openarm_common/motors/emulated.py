@@ -61,12 +61,12 @@ class EmulatedMotor:
 
     Args:
         axis: Its wiring.
-        q: Where it is, rad of the motor.
+        q: Position, rad of the motor.
 
     Attributes:
         q, dq: Of the motor; set by what it moves.
-        tau: Of the motor; set by what it moves.
-        on: Whether it is enabled.
+        tau: Torque of the motor; set by what it moves.
+        on: True while it is enabled.
         error: Status nibble of an error, else 0.
     """
 

@@ -253,7 +253,7 @@ def decode_feedback(kind: MotorType, data: bytes, motor: int = 0) -> Feedback | 
 
     Args:
         kind: Type of the motor.
-        data: Of the frame.
+        data: Data of the frame.
         motor: Id of the motor, by the id of the frame; only ids above 15 matter.
     """
     if len(data) != 8:

@@ -28,7 +28,7 @@ class JointMotors(Config):
     """Motors of the joints of an arm.
 
     Attributes:
-        types: Of the motors.
+        types: Types of the motors.
         stiffness, damping: Gains kp and kd of their commands, N m/rad and N m s/rad.
         stop_damping: kd with which an arm stops softly when it can't be held.
         ids: Ids of frames to them, unless an arm has its own; of frames from them `reply_offset` is added.

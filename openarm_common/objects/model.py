@@ -92,12 +92,12 @@ class ObjectModel:
     """An object.
 
     Attributes:
-        source: As a scene names it.
-        label: What it is.
+        source: Name in scenes.
+        label: Label of the object.
         mass: kg.
         friction: Sliding, torsional and rolling (m) against table and objects; None: those of the simulation.
         rgb: Colour, 0 to 1; of what has a texture, None.
-        visual: What is seen.
+        visual: Visual shape.
         texture: Its picture; None without.
         parts: Convex parts of even density, which are in contact.
     """

@@ -49,7 +49,7 @@ def posed_object(source: str, side: int = 0, attitude: tuple[float, ...] | None 
     """Return an object as it lies.
 
     Args:
-        source: As `load_object`.
+        source: Same as for `load_object`.
         side: Number of the side that it rests on, the most frequent first; not used with an attitude.
         attitude: Quaternion (x, y, z, w) of its own frame in that of the box; None: it rests on the side.
 

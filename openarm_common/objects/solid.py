@@ -115,7 +115,7 @@ def crossings(part: Part, points: Array, direction: Array) -> Crossings:
     """Return where lines cross a part.
 
     Args:
-        part: In the frame of the lines.
+        part: Part, in the frame of the lines.
         points: (n, 3) of the lines, m.
         direction: (3,) unit, of all lines.
     """

@@ -161,10 +161,10 @@ class Leaves:
     Attributes:
         resolution: Edge of a cell of level 0, m.
         raw: The tree, sound.
-        binary: Which form it has.
+        binary: True for the binary form.
         nodes: Nodes of the tree, inner ones too.
         tree: Class of the tree.
-        robot: In whose base frame it is; "" where a file does not say it, as those of other programs.
+        robot: Robot in whose base frame it is; "" where a file does not say it, as those of other programs.
     """
 
     resolution: float
@@ -230,7 +230,7 @@ class _Reader:
 
     Args:
         raw: The tree.
-        binary: Which form it has.
+        binary: True for the binary form.
         tree: Class of the tree.
     """
 
@@ -278,7 +278,7 @@ def decode(data: Bytes | bytes, resolution: float, *, binary: bool, tree: str = 
     Args:
         data: Payload without a file header; empty is the empty map.
         resolution: Edge of a cell, m.
-        binary: Which form it has.
+        binary: True for the binary form.
         tree: Class of the tree.
 
     Raises:
@@ -309,7 +309,7 @@ def write_file(path: Path, payload: Payload, resolution: float, robot: str = "")
         path: Ends in .bt or .ot.
         payload: The tree.
         resolution: Edge of a cell, m.
-        robot: In whose base frame it is; "" is not written.
+        robot: Robot in whose base frame it is; "" is not written.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the suffix does not fit the payload or the folder can't be written.

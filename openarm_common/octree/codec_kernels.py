@@ -87,7 +87,7 @@ def _fold_states(rows: Rows, states: Bytes, row: int, tree: Bytes) -> None:
     Args:
         rows: The cells.
         states: (capacity,) of each code.
-        row: Of the block.
+        row: Row of the block.
         tree: (584,) filled: states of its 512 cells, then of the 64 nodes above them, then of the 8 above these.
     """
     codes = rows.pool[row]
@@ -182,7 +182,7 @@ def read_states(
     """Read the next leaves of a tree of two bytes per inner node.
 
     Args:
-        data: As `write_states` writes it.
+        data: Bytes that `write_states` writes.
         low: Log-odds of free leaves.
         high: Log-odds of occupied leaves.
         stack: (136, 4) level, x, y, z of nodes that are not read yet; at first the root alone, at level 16.
@@ -404,7 +404,7 @@ def read_values(data: Bytes, extra: int, stack: Ints, at: Ints, leaves: Keys, bi
     """Read the next leaves of a tree of five bytes per node and some more; as `read_states`.
 
     Args:
-        data: As `write_values` writes it.
+        data: Bytes that `write_values` writes.
         extra: Bytes between the log-odds of a node and the bits of its children, which are skipped.
         stack: (136, 4).
         at: (3,).

@@ -69,9 +69,9 @@ class DistanceField:
     """One version of the field.
 
     Attributes:
-        lattice: Which cells.
+        lattice: Cells of the map.
         distances: (nx, ny, nz) float32, read-only, m.
-        reach: Where distances are cut, m.
+        reach: Largest distance; others are cut to it, m.
         frame: Frame of the cells.
         version: Counts up with every update, from 1.
         t_ns: Stamp of the newest image in it.
@@ -115,7 +115,7 @@ class DistanceField:
         Args:
             now_ns: The monotonic clock.
             limit_s: Longest age of the field and of every camera's last contribution, s.
-            cameras: Which cameras matter; None is all.
+            cameras: Cameras that matter; None is all.
 
         Raises:
             OpenArmError: STALE_DATA, with what is how old.
@@ -152,9 +152,9 @@ class DistanceFieldWriter:
     """Owns the shared field; one at a time for a name. The field of an earlier one is replaced.
 
     Args:
-        path: From `field_path`.
-        lattice: Which cells.
-        reach: Where distances are cut, m.
+        path: Path from `field_path`.
+        lattice: Cells of the map.
+        reach: Largest distance; others are cut to it, m.
         frame: Frame of the cells.
         cameras: Names of those that contribute, at most 8.
 
@@ -240,7 +240,7 @@ class DistanceFieldReader:
     """Reads the field of a name; may be made before the writer, and survives its restart.
 
     Args:
-        path: From `field_path`.
+        path: Path from `field_path`.
     """
 
     def __init__(self, path: Path) -> None:

@@ -46,17 +46,17 @@ class RobotDescription:
         srdf: SRDF text, or "".
         name: Name of the robot.
         root: The link that is no joint's child.
-        links: By name, in the order of the URDF.
-        joints: By name, in the order of the URDF.
-        semantics: What the SRDF says.
+        links: Links by name, in the order of the URDF.
+        joints: Joints by name, in the order of the URDF.
+        semantics: Content of the SRDF.
         base: Base frame.
-        arms: By name.
-        hands: By arm.
-        lift: That carries all arms; None: they stand on the base.
+        arms: Arms by name.
+        hands: Hands by arm.
+        lift: Lift that carries all arms; None: they stand on the base.
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
-        motion: What plans ask of the joints of an arm, where its folder says it.
-        motors: Of each arm, where its folder says them.
-        zeros: By joint, where it is minus what it reports, rad or m; see `with_zeros`.
+        motion: Limits that plans keep for the joints of an arm, where its folder says them.
+        motors: Motors of each arm, where its folder says them.
+        zeros: Position minus reported position by joint, rad or m; see `with_zeros`.
     """
 
     urdf: str
@@ -193,7 +193,7 @@ class RobotDescription:
         whatever reads the description takes and gives reported positions.
 
         Args:
-            offsets: By joint, rad (m for one that slides); in addition to those that the robot has.
+            offsets: Offsets by joint, rad (m for one that slides); in addition to those that the robot has.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, as `joint`, for offsets that are not finite, and for joints that are fixed,
@@ -226,7 +226,7 @@ class RobotDescription:
         """Return the robot with hands, by arm, as they were learned.
 
         Raises:
-            OpenArmError: As `hand`.
+            OpenArmError: Same as `hand`.
         """
         learned = {arm: self.hand(arm).with_reach(reach) for arm, reach in hands.items()}
         return replace(self, hands={**self.hands, **learned}, _described=self.described)
@@ -354,7 +354,7 @@ class RobotDescription:
         """Return by movable joint how far a point can move when the joint does: at most m per rad, or m per m.
 
         Args:
-            link: That carries the point.
+            link: Link that carries the point.
             offset: Distance of the point from the origin of the link, m.
 
         Raises:

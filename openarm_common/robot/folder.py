@@ -37,8 +37,8 @@ class ArmParts(Config):
         flange: Link that the last of them moves; it carries the hand, cameras and boards.
         hand: Link that the fingers move on.
         tcp: Link of the tool centre point: z out of the fingers, y the opening direction.
-        finger_joint: That drives the fingers; "": the arm has no hand, and is planned for alone.
-        finger_sign: Of its positions, against those of the robot's hand.
+        finger_joint: Joint that drives the fingers; "": the arm has no hand, and is planned for alone.
+        finger_sign: Sign of its positions, against those of the robot's hand.
         fingers: Their links; the pad of each is its collision shape `{link}_pad_collision`.
     """
 
@@ -72,14 +72,14 @@ class RobotFolder(Config):
         srdf: Pairs of links that may touch, groups and postures.
         cameras: YAML of the cameras; "": it has none.
         base: Base frame: x forward, y left, z up, on the floor.
-        hand: What the fingers of each arm can do; None: nothing is known of them.
-        motion: What plans ask of the joints of an arm; None: parameters of the motion node say it.
-        motors: Of each arm; None: it is not simulated.
+        hand: Abilities of the fingers of each arm; None: nothing is known of them.
+        motion: Limits that plans keep for the joints of an arm; None: parameters of the motion node say them.
+        motors: Motors of each arm; None: it is not simulated.
         hardware: YAML of the motors on CAN, where the robot is one that has them; it may be another robot's.
-        arms: By name; the group of each in the SRDF is `NAME_arm`.
-        lift: That carries all arms; None: they stand on the base.
+        arms: Arms by name; the group of each in the SRDF is `NAME_arm`.
+        lift: Lift that carries all arms; None: they stand on the base.
         mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
-        work: Where it works; None: it has no table, and no scenes.
+        work: Workplace; None: it has no table, and no scenes.
     """
 
     xacro: str = ""
@@ -228,7 +228,7 @@ def robot_hand() -> HandParts:
     """Return the hand of this process's robot.
 
     Raises:
-        OpenArmError: As `load_folder`; CONFIG_INVALID, when its `robot.yaml` does not say it.
+        OpenArmError: Same as `load_folder`; CONFIG_INVALID, when its `robot.yaml` does not say it.
     """
     folder, robot = load_folder(robot_name())
     return _said(robot.hand, f"{folder / 'robot.yaml'}:hand: missing; it says what the fingers are and can do")
@@ -239,7 +239,7 @@ def robot_work() -> Work:
     """Return where this process's robot works.
 
     Raises:
-        OpenArmError: As `load_folder`; CONFIG_INVALID, when its `robot.yaml` does not say it.
+        OpenArmError: Same as `load_folder`; CONFIG_INVALID, when its `robot.yaml` does not say it.
     """
     folder, robot = load_folder(robot_name())
     where = "where the table and the objects before the robot are"

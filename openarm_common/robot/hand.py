@@ -75,10 +75,10 @@ class Hand:
     """The fingers of one arm.
 
     Attributes:
-        joint: That drives them.
+        joint: Joint that drives them.
         sign: Sign of its positions, against those of `parts`.
         parts: Measures; the opening is that of the reach.
-        reach: As it was learned; None: the drawing stands for it.
+        reach: Reach that was learned; None: the drawing stands for it.
     """
 
     joint: str

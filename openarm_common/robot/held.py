@@ -13,7 +13,7 @@ class HeldBox:
     """A box that hangs on a link.
 
     Attributes:
-        name: For people.
+        name: Name for people.
         link: Link that carries it.
         T_link_box: Its middle in the link, (4, 4).
         size: Edges (3,), m.

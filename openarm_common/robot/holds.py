@@ -36,7 +36,7 @@ class ArmHolds:
 
         Args:
             key: First bytes of the ids of its goals.
-            holder: For people.
+            holder: Name of the holder, for people.
             arms: Names of the arms.
             now: Present time of any clock.
         """

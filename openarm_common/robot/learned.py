@@ -99,9 +99,9 @@ def keep_hand(calibrations: Path, of: str, arm: str, reach: HandReach) -> Path:
 
     Args:
         calibrations: Folder of the calibrations.
-        of: What the zeros of the robot are stored as.
-        arm: Which hand.
-        reach: What was learned of it.
+        of: Name that the zeros of the robot are stored by.
+        arm: Arm of the hand.
+        reach: Reach that was learned.
     """
     store, others = LearnedStore(calibrations, StoredHands), dict[str, HandReach]()
     with contextlib.suppress(OpenArmError):

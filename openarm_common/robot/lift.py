@@ -20,7 +20,7 @@ class LiftParts(Config):
         stiffness: Position gain of the simulated drive, N/m; one with a spindle hardly gives.
         damping: Velocity gain, N s/m.
         acceleration: Acceleration of plans, m/s2; their velocity is that of the URDF.
-        jerk: Of plans, m/s3.
+        jerk: Jerk of plans, m/s3.
     """
 
     joint: str

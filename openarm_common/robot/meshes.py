@@ -37,7 +37,7 @@ def mesh_file(name: str, urdf: Path, packages: Mapping[str, Path] | None = None)
     """Find the file of a mesh.
 
     Args:
-        name: As the URDF says it: a path, absolute or from the folder of the URDF, `file://PATH`, or
+        name: Name in the URDF: a path, absolute or from the folder of the URDF, `file://PATH`, or
             `package://NAME/PATH`; see `package_folders`. A path that is not there but has `/share/NAME/`, as a xacro
             that was expanded on another machine, is that of a package.
         urdf: File of the description.

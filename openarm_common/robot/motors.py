@@ -82,7 +82,7 @@ class Motors(_ByJoint):
     """Position servos of an arm as owners of the robot have them.
 
     Attributes:
-        gains: Of the servos.
+        gains: Gains of the servos.
         stiff: Gains of the profile `ideal`.
         armature: Inertia of rotor and gear, kg m2.
         gravity_compensation: Share of the arms' weight that the motors carry by themselves.

@@ -31,7 +31,7 @@ class Posture:
     Attributes:
         T_base_frame: (4, 4) pose of the frame that was asked for, m.
         joints: Positions by joint name, rad or m; empty when they were not asked for, or are not known.
-        held: What the hands hold.
+        held: Boxes that the hands hold.
         lack: Why the joints are not known, where they are optional.
     """
 

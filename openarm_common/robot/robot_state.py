@@ -57,7 +57,7 @@ class RobotStateBuffer:
 
     Args:
         description: The robot; its root is the base frame.
-        capacity: How many joint states are kept (400 is 4 s at 100 Hz).
+        capacity: Number of joint states that are kept (400 is 4 s at 100 Hz).
     """
 
     def __init__(self, description: RobotDescription, capacity: int = 400) -> None:
@@ -146,7 +146,7 @@ class RobotStateBuffer:
 
         Args:
             t_ns: Stamp.
-            frame: Whose position they must give within `MAX_ERROR`; empty: of every link.
+            frame: Frame whose position they must give within `MAX_ERROR`; empty: every link.
 
         Raises:
             OpenArmError: STALE_DATA, when no joint state is near enough and no two bracket the stamp, with the gap; or

@@ -104,7 +104,7 @@ class SelfFilter:
 
         Args:
             joints: Positions by joint name, rad or m.
-            held: What hangs on its links.
+            held: Boxes that hang on its links.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, for a joint without a position; NO_TRANSFORM, for a held box on a link that

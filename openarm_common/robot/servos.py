@@ -83,7 +83,7 @@ class ArmLoad:
         Args:
             lower: (k,) limits of the joints.
             upper: The same.
-            mass: At the tool, kg.
+            mass: Mass at the tool, kg.
             n: Postures that are tried.
         """
         rng, found, held = np.random.default_rng(0), list[Array](), list[Array]()

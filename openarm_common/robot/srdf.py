@@ -50,7 +50,7 @@ def shifted(text: str, offsets: Mapping[str, float]) -> str:
 
     Args:
         text: SRDF, or "".
-        offsets: By joint, rad or m.
+        offsets: Offsets by joint, rad or m.
     """
     if not text:
         return text

@@ -31,7 +31,7 @@ def other_ways(q: Array, near: Array, upper: Array) -> Array:
     Args:
         q: (k, n) positions in the turns nearest to `near`.
         near: (n,) positions.
-        upper: As `nearest_turns`.
+        upper: Same as for `nearest_turns`.
 
     Returns:
         (m k, n) of m such joints: all of the first, then all of the next.

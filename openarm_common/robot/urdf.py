@@ -58,7 +58,7 @@ class Mesh:
     """A visual mesh on a link.
 
     Attributes:
-        file: As the URDF names it; absolute, `file://PATH`, in a robot that was read from files.
+        file: Name in the URDF; absolute, `file://PATH`, in a robot that was read from files.
         scale: Factors of x, y, z; negative ones mirror.
         rgba: Colour, None without one.
     """
@@ -148,7 +148,7 @@ def rewritten(text: str, joints: Iterable[Joint]) -> str:
 
     Args:
         text: Well-formed URDF.
-        joints: That the text has by these names.
+        joints: Joints of these names in the text.
     """
     root = parse_root(text, "URDF")
     elements = {element.get("name"): element for element in root.findall("joint")}

@@ -58,7 +58,7 @@ class Work(Config):
 
     Attributes:
         table: Table of scenes that say nothing else.
-        least_x: Of the front edge of any table: one that reaches further back would stand in the robot.
+        least_x: Front edge of any table, at least: one that reaches further back would stand in the robot.
         region: Region of objects.
         hand_over: None with one arm.
     """

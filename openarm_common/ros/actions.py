@@ -110,8 +110,8 @@ class Watch:
     """Notices when a server dies, which discovery says seconds later.
 
     Args:
-        node: That asks.
-        topic: On which the server publishes; empty: any.
+        node: Node that asks.
+        topic: Topic on which the server publishes; empty: any.
         what: Names the server where its node is not known.
         server: Full name of its node; empty: any that publishes on the topic.
     """
@@ -276,7 +276,7 @@ def check_alive(died: Callable[[], str], what: str, code: Code = Code.NOT_READY)
     """Raise when a server has died.
 
     Args:
-        died: Of `ActionClient.watch`.
+        died: Result of `ActionClient.watch`.
         what: Was asked of it.
         code: Code of the error.
 

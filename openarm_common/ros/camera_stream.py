@@ -43,13 +43,13 @@ class CameraStream:
     """Subscribes on demand and gives frames, each when its posture is known.
 
     Args:
-        node: That subscribes.
+        node: Node that subscribes.
         states: States of the robot; None: frames need no posture.
         topics: Message type and topic of each stream.
         frame_id: Coordinate frame that every message must have; empty: any.
-        pose_of: As for `FrameStream`.
+        pose_of: Same as for `FrameStream`.
         joints: Whether the joints are needed; if so, joint states are subscribed to with the streams.
-        capacity: As for `FrameStream`, and so is `max_rate`.
+        capacity: Same as for `FrameStream`, and so is `max_rate`.
         max_rate: Hz.
         on_frame: Takes each frame as soon as its posture is known; without it, messages wait in the middleware, the
             newest two of each stream, until `take`.

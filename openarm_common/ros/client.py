@@ -52,7 +52,7 @@ class ContextNode:
         name: Name of the node; names that begin with _ are hidden.
         domain: ROS_DOMAIN_ID; None takes the environment's.
         bare: Without parameter services and /rosout.
-        context: Of `new_context`, where several nodes share one; it stays when this node is closed.
+        context: Context from `new_context`, where several nodes share one; it stays when this node is closed.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class ContextNode:
             future: Awaited.
             seconds: Longest wait.
             what: Does answer, for the error.
-            died: Of `ActionClient.watch`, where that is an action.
+            died: Result of `ActionClient.watch`, where that is an action.
 
         Raises:
             OpenArmError: TIMEOUT, naming `what` did not answer; NOT_READY, when its server has died.
@@ -186,7 +186,7 @@ class BackgroundNode(ContextNode):
         Args:
             kind: Type of the action.
             name: Name of the action.
-            goal: To send.
+            goal: Goal to send.
             timeout: Longest wait for the end, s of wall clock; then, and at any exception, the goal is cancelled, and
                 its end is waited for.
             on_feedback: Called with each feedback, in the background thread; what it raises is raised here.

@@ -131,7 +131,7 @@ def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int, basel
         intrinsics: Intrinsics of the camera.
         frame_id: Optical frame.
         t_ns: Stamp.
-        baseline: From the left camera of a stereo pair to this one, its right one, m; 0 of others.
+        baseline: Distance of the left camera of a stereo pair from this one, its right one, m; 0 of others.
     """
     info = CameraInfo(header=header(frame_id, t_ns), height=intrinsics.height, width=intrinsics.width)
     info.distortion_model = "plumb_bob"

@@ -44,7 +44,7 @@ def detections_to_msg(
     """Return the message of the objects of an image.
 
     Args:
-        detections: In the frame.
+        detections: Detections in the frame.
         covariances: (6, 6) of the pose of each: x, y, z, roll, pitch, yaw, m and rad.
         frame_id: Frame of the poses.
         t_ns: Stamp of the image.
@@ -93,7 +93,7 @@ def hypothesis(name: str, score: float, pose: PoseWithCovariance | None = None) 
     Args:
         name: The class.
         score: 0 to 1.
-        pose: With its covariance.
+        pose: Pose with its covariance.
     """
     return ObjectHypothesisWithPose(
         hypothesis=ObjectHypothesis(class_id=name, score=score), pose=pose or PoseWithCovariance()

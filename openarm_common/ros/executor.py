@@ -183,7 +183,7 @@ class _Kept:
     """A wait set, what it waits for, and the open handles of that.
 
     Args:
-        nodes: Whose entities are waited for.
+        nodes: Nodes whose entities are waited for.
         guards: Guard conditions of the executor.
         context: Context of both.
     """

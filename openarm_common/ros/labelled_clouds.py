@@ -27,7 +27,7 @@ def labelled_cloud_to_msg(cloud: LabelledCloud, optical_frame: str, t_ns: int) -
 
     Args:
         cloud: The cloud.
-        optical_frame: Of the camera, whose origin is where the image was taken from.
+        optical_frame: Optical frame of the camera, whose origin is where the image was taken from.
         t_ns: Stamp of the image.
     """
     message = PointCloud2(header=header(optical_frame, t_ns), height=1, width=len(cloud.points), is_dense=True)

@@ -49,7 +49,7 @@ class Polled:
 
     Args:
         node: Owns it.
-        source: What is subscribed to.
+        source: Topic that is subscribed to.
     """
 
     def __init__(self, node: Node, source: Source) -> None:

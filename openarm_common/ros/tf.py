@@ -51,7 +51,7 @@ class RobotStateListener:
         depth: Joint states that wait: few for a node that acts on the newest; those of the time that an image takes for
             one that asks for the stamp of an image.
         wait: Longest wait for what a posture needs, s.
-        held_topic: What the hands hold, as markers on links; empty: not subscribed to.
+        held_topic: Topic of what the hands hold, as markers on links; empty: not subscribed to.
     """
 
     def __init__(

@@ -40,8 +40,8 @@ class Place(NamedTuple):
     """A board for a camera.
 
     Args:
-        camera: Which.
-        arm: That holds it, for a fixed camera; "": it lies on the table.
+        camera: Camera that sees it.
+        arm: Arm that holds it, for a fixed camera; "": it lies on the table.
     """
 
     camera: CameraConfig
@@ -84,9 +84,9 @@ def board_of(camera: CameraConfig, description: RobotDescription, arm: str = "")
     """Return the link that carries the board for a camera ("": the world), and its pose in the frame of it, (4, 4).
 
     Args:
-        camera: Which.
+        camera: Camera that sees it.
         description: The robot.
-        arm: That holds it, for a fixed camera; "": the last one.
+        arm: Arm that holds it, for a fixed camera; "": the last one.
     """
     anyhow = dict.fromkeys(description.joints, 0.0)
     moves = description.arm_of(camera.parent)

@@ -212,7 +212,7 @@ def _mesh_keys(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of a mesh with what its object says: label, mass, size.
 
     Raises:
-        ValueError: With what is wrong with the object, for pydantic.
+        ValueError: The fault of the object, for pydantic.
     """
     from openarm_common.objects.posed import posed_object
 
@@ -388,7 +388,7 @@ def random_scene(seed: int, count: int | None = None) -> Scene:
 
     Args:
         seed: Same seed, same scene.
-        count: How many objects; None draws it.
+        count: Number of objects; None draws it.
     """
     rng, region = np.random.default_rng(seed), robot_work().region
     number = int(rng.integers(1, 5)) if count is None else count

@@ -25,7 +25,7 @@ class ControllerServer(ABC, Generic[OutcomeT]):
 
     Args:
         node: Owner.
-        loop: Whose thread runs the controller.
+        loop: Loop whose thread runs the controller.
         check: Refuses a goal, by its id, while another client holds the arm.
         label: Names arm or gripper in the log.
         kind: Type of the action.
@@ -71,7 +71,7 @@ class ControllerServer(ABC, Generic[OutcomeT]):
         """Start a goal between two ticks and wait for its end.
 
         Args:
-            handle: Of the goal.
+            handle: Handle of the goal.
             start: Starts it; is given the function that takes the outcome.
 
         Raises:

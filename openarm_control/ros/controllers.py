@@ -33,9 +33,9 @@ class Controllers:
 
     Args:
         node: Owner.
-        loop: Whose thread runs them.
+        loop: Loop whose thread runs them.
         controller: Controller of all joints.
-        servos: By which it carries the arms.
+        servos: Servos that carry the arms.
         gripper_action: Type of `gripper_cmd`.
         prefix: Prefix of the names of the actions and topics of arms and grippers.
     """

@@ -42,7 +42,7 @@ class GripperServer(ControllerServer[GripperOutcome]):
         prefix: Prefix of its name.
         side: left or right.
         gripper: Its controller.
-        loop: Whose thread runs the controller.
+        loop: Loop whose thread runs the controller.
         check: Refuses a goal, by its id, while another client holds the arm.
         action: parallel (ParallelGripperCommand) or classic (GripperCommand).
     """

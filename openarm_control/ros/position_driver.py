@@ -34,8 +34,8 @@ class PositionDriver:
 
     Args:
         node: Publishes.
-        controller: Whose joints they are.
-        arm_topic: Of position commands of an arm; {arm} stands for its side.
+        controller: Controller of the joints.
+        arm_topic: Topic of position commands of an arm; {arm} stands for its side.
         gripper_topic: The same of a gripper.
         prefix: Prefix of the topic on which joint states are passed on.
     """

@@ -17,7 +17,7 @@ class ControlNode(BaseNode[ConfigT]):
     """A node with a thread that controls.
 
     Attributes:
-        scheduling: Of the process, as /diagnostics says it.
+        scheduling: Scheduling of the process, for /diagnostics.
     """
 
     scheduling = ""
@@ -42,7 +42,7 @@ def timely(make: Callable[[], NodeT], priority: Callable[[NodeT], int]) -> NodeT
 
     Args:
         make: Makes it.
-        priority: Of its process under SCHED_FIFO.
+        priority: Priority of its process under SCHED_FIFO.
     """
     sys.setswitchinterval(0.0005)  # the thread must not wait 5 ms, the default, for another one
     node = make()

@@ -47,7 +47,7 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         prefix: Prefix of its names.
         side: left or right.
         arm: Its controller.
-        loop: Whose thread runs the controller.
+        loop: Loop whose thread runs the controller.
         check: Refuses a goal, by its id, while another client holds the arm.
     """
 

@@ -25,10 +25,10 @@ class CameraFeed:
         silent_s: A camera that gave no picture for so long is opened again.
 
     Attributes:
-        device: What it is, in words; empty while it is not open.
+        device: Name of the device, in words; empty while it is not open.
         fault: Why there are no pictures; empty: there are.
         frames: Pictures so far.
-        opened: How often it was opened.
+        opened: Number of times that it was opened.
     """
 
     def __init__(self, source: CameraSource, take: Callable[[CameraFrame], None], silent_s: float = _SILENT_S) -> None:

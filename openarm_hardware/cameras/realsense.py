@@ -46,7 +46,7 @@ class RealSense:
     """See `CameraSource`.
 
     Args:
-        config: Which, and how.
+        config: Camera and its streams.
         devices: Lists devices; those that are plugged in when not given.
     """
 

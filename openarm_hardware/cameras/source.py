@@ -30,7 +30,7 @@ class CameraFrame:
         t_ns: Wall clock at its exposure, by the best clock that the driver has.
         color: (h, w, 3) RGB.
         depth: (h, w) mm, 0 where there is none, aligned to `color`; None for a camera without depth.
-        imu: What the IMU has measured since the last one.
+        imu: Measurements of the IMU since the last one.
     """
 
     t_ns: int

@@ -20,7 +20,7 @@ class UsbCamera:
     """See `CameraSource`.
 
     Args:
-        config: Which, and how.
+        config: Camera and its streams.
 
     Raises:
         OpenArmError: CONFIG_INVALID, without a calibration that fits: pixels alone say nothing of directions.

@@ -30,11 +30,11 @@ class CameraNode(BaseNode[ConfigT]):
         name: Name of the node.
         model: Model of its parameters.
         source: Makes the camera of the parameters.
-        silent_s: As of `CameraFeed`.
-        kwargs: Of the node.
+        silent_s: Same as for `CameraFeed`.
+        kwargs: Arguments of the node.
 
     Raises:
-        OpenArmError: What the camera can't be made by.
+        OpenArmError: Same as the camera's constructor.
     """
 
     def __init__(

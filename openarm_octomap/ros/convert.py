@@ -43,7 +43,7 @@ def centres_msg(lattice: Lattice, states: NDArray[np.uint8], frame: str, t_ns: i
     """Return centres of the occupied cells.
 
     Args:
-        lattice: Which cells.
+        lattice: Cells of the map.
         states: (nx, ny, nz).
         frame: Base frame.
         t_ns: Stamp.
@@ -56,7 +56,7 @@ def changes_msg(lattice: Lattice, states: NDArray[np.uint8], changed: CellSet, f
     """Return cells whose state changed, with a field `state`: 0 unknown, 1 free, 2 occupied.
 
     Args:
-        lattice: Which cells.
+        lattice: Cells of the map.
         states: (nx, ny, nz).
         changed: The cells.
         frame: Base frame.
@@ -74,7 +74,7 @@ def markers_msg(lattice: Lattice, states: NDArray[np.uint8], frame: str, t_ns: i
     """Return the occupied cells as cubes, coloured by height.
 
     Args:
-        lattice: Which cells.
+        lattice: Cells of the map.
         states: (nx, ny, nz).
         frame: Base frame.
         t_ns: Stamp.
@@ -98,7 +98,7 @@ def projected_msg(lattice: Lattice, states: NDArray[np.uint8], frame: str, t_ns:
     """The map seen from above: 100 where a column has an occupied cell, 0 where it has a free one only, else -1.
 
     Args:
-        lattice: Which cells.
+        lattice: Cells of the map.
         states: (nx, ny, nz).
         frame: Base frame.
         t_ns: Stamp.

@@ -32,7 +32,7 @@ class MapTopic:
         show: Publishes a map that a message has changed.
 
     Attributes:
-        text: What became of the newest message; empty before the first.
+        text: State of the newest message; empty before the first.
         fault: Why it is not in the map; empty when it is.
 
     Raises:

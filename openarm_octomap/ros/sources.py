@@ -110,7 +110,7 @@ def depth_source(
     """Return the source of the depth images of a camera, in its optical frame.
 
     Args:
-        node: That subscribes.
+        node: Node that subscribes.
         states: States of the robot.
         camera: The camera.
         topics: `depth` and `info`, with {camera} for its name.
@@ -131,7 +131,7 @@ def cloud_source(node: BaseNode[Any], states: RobotStateListener, topic: str, jo
     """Return the source of clouds in any known frame, whose origin is taken for that of the rays.
 
     Args:
-        node: That subscribes.
+        node: Node that subscribes.
         states: States of the robot.
         topic: Topic of the clouds.
         joints: Whether the joints are needed, to cut the robot out.

@@ -29,8 +29,8 @@ class Letterbox:
     Attributes:
         width: Width of the input.
         height: Height of the input.
-        left: Where the image begins.
-        top: Where the image begins.
+        left: Column at which the image begins.
+        top: Row at which the image begins.
         inner: (width, height) that the image takes.
         scale: (x, y) input pixels per image pixel; they differ by the rounding of `inner`.
     """
@@ -89,7 +89,7 @@ def suppress(found: Candidates, max_overlap: float, limit: int = 100) -> Candida
 
     Args:
         found: Best first.
-        max_overlap: Of the same class, what overlaps a better box by more (intersection over union) is dropped; of
+        max_overlap: Overlap (intersection over union) from which on what is worse is dropped, of the same class; of
             another class, what overlaps halfway from there to 1.
         limit: Most boxes.
     """

@@ -41,9 +41,9 @@ def labelled_cloud(
     Args:
         view: The image.
         smooth: (h, w) its depth as of `smooth_depth`.
-        boxes: What was detected in it; the i-th has label i, counted from 1.
+        boxes: Objects that were detected in it; the i-th has label i, counted from 1.
         limits: Depths that count.
-        flying: Which pixels float.
+        flying: Thresholds of pixels that float.
     """
     label, near = np.zeros(view.depth.shape, np.uint32), np.zeros(view.depth.shape, np.bool_)
     scan = DepthView(view.depth, view.intrinsics, view.T_base_camera, limits.near, limits.far)

@@ -36,13 +36,13 @@ class Detection2D(Described):
     """Something found in an image; pixels.
 
     Attributes:
-        name: As `Described`; so are `color` and `kind`, the shape where the detector knows it.
-        score: How certain, 0 to 1.
+        name: Same as for `Described`; so are `color` and `kind`, the shape where the detector knows it.
+        score: Confidence, 0 to 1.
         centre: (u, v) of the middle of the box.
         size: (width, height) of the box.
         mask: (height, width) bool, the pixels of the box that belong to the object.
         truncated: Whether the border of the image cuts it.
-        cluster: What the segmentation of depth says of it; None of what was found by colour or a network.
+        cluster: Result of the segmentation of depth; None of what was found by colour or a network.
     """
 
     name: str
@@ -224,7 +224,7 @@ def rank(detections: Sequence[Detection2D], policy: Policy, image_size: tuple[in
     """Return detections in the order in which they should be taken.
 
     Args:
-        detections: In any order.
+        detections: Detections in any order.
         policy: `score`: the most certain first; `centre`: the one nearest to the middle of the image first.
         image_size: (width, height), pixels.
     """

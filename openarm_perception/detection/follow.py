@@ -26,11 +26,11 @@ def followed(
 
     Args:
         objects: After the image before.
-        perceived: What was detected.
+        perceived: Objects that were detected.
         seen: The image.
         limits: Depths that count.
         t_ns: Stamp of the image.
-        carried: What the hands hold, by name; None: not known.
+        carried: Boxes that the hands hold, by name; None: not known.
     """
     smooth = smooth_depth(seen, limits)
     cloud = labelled_cloud(seen, smooth, perceived.boxes, limits)

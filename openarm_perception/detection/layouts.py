@@ -105,7 +105,7 @@ def layout_of(output: NDArray[np.floating], classes: int, extra: int, size: tupl
 
     Args:
         output: (a, b).
-        classes: How many the network knows.
+        classes: Number of classes of the network.
         extra: Channels after those of scores and classes.
         size: (width, height) of the input.
     """
@@ -136,7 +136,7 @@ def decode(table: Table, threshold: float, max_overlap: float, limit: int = 100)
     Args:
         table: (4 + classes, n): cx, cy, width, height, then a score for each class.
         threshold: Least score.
-        max_overlap: As `suppress`.
+        max_overlap: Same as for `suppress`.
         limit: Most boxes.
     """
     found = YOLOV8.found(table, len(table) - 4, threshold, (1, 1))

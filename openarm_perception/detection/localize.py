@@ -98,7 +98,7 @@ class Localizer:
     """Finds where detections are.
 
     Args:
-        config: What counts as the object.
+        config: Thresholds of what counts as the object.
         limits: Depths that the camera can be trusted with.
         table_height: Height of the table in the base frame, m.
     """
@@ -175,7 +175,7 @@ class Localizer:
         slipped in the hand does. What is hidden or beyond the border of the image is not in the box.
 
         Args:
-            patch: Of the detection.
+            patch: Patch of the detection.
             withheld: Why nothing of the frame may be measured: where table and objects seem to be says nothing then.
         """
         solid = self._solid(patch) if withheld is None else self._on_object(patch)
@@ -198,7 +198,7 @@ class Localizer:
         """Locate the object of a detection without depth: an upright convex prism of known height on the table.
 
         Args:
-            found: In the colour image.
+            found: Detection in the colour image.
             height: Height of the object, m.
             intrinsics: Intrinsics of the camera.
             T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image; any attitude.

@@ -105,7 +105,7 @@ class NetworkDetector:
     """Finds what a network was trained for. The masks of its detections are their whole boxes.
 
     Args:
-        config: Which network.
+        config: File of the network, and its thresholds.
 
     Raises:
         OpenArmError: CONFIG_INVALID, naming the file and what is wrong with it: missing, damaged, of another layout,
@@ -128,7 +128,7 @@ class NetworkDetector:
         """The same network with other numbers; the file is read only where the configuration asks for another one.
 
         Raises:
-            OpenArmError: As the constructor; this detector is as it was.
+            OpenArmError: Same as the constructor; this detector is as it was.
         """
         if config.model_dump(include=_OF_THE_FILE) != self.config.model_dump(include=_OF_THE_FILE):
             return NetworkDetector(config)

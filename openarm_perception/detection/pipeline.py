@@ -53,8 +53,8 @@ class Perceived:
     """The objects of a frame, the first choice at the front.
 
     Attributes:
-        found: In the image.
-        located: In the base frame; those of `found` that could be.
+        found: Detections in the image.
+        located: Objects in the base frame; those of `found` that could be located.
         refused: Why the others could not be, one sentence each.
         unmeasured: Boxes around what is visible of those: obstacles, but no targets.
         robot: (h, w) pixels that show the robot or what it holds; None when it was not searched for.
@@ -87,7 +87,7 @@ class Pipeline:
     Args:
         detector: Finds them in the colour image.
         localizer: Finds where they are.
-        policy: Which comes first.
+        policy: Rule by which they are ranked.
         label: Only objects that these words fit; empty takes all.
         faults: Objects that are missed, by fault injection.
     """
@@ -309,14 +309,14 @@ def make_pipeline(
     """Make the pipeline of a kind; the network is read only by those that use it.
 
     Args:
-        kind: What finds objects.
+        kind: Kind of the detector.
         colors: Finds and names colours.
-        network: Which network, and what counts as found.
+        network: File of the network, and its thresholds.
         localizer: Finds where objects are.
-        policy: Which comes first.
+        policy: Rule by which they are ranked.
         label: Only objects that these words fit; empty takes all.
         before: The pipeline that it takes the place of, whose network is not read again where it is the same.
-        tags: Which tags are read, and what counts as one.
+        tags: Family and size of the tags.
 
     Raises:
         OpenArmError: CONFIG_INVALID or INVALID_ARGUMENT, from the network.
@@ -353,7 +353,7 @@ def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D |
     """Cut out the object in a box: what rises above the table there and has the colour of its middle.
 
     Args:
-        box: Of the network.
+        box: Box of the network.
         view: The frame.
         localizer: Has the height of the table.
 

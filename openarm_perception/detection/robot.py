@@ -53,7 +53,7 @@ class RobotFinder:
         Args:
             view: The image, and the pose of its camera at its stamp.
             joints: Positions at that stamp by joint name, rad or m.
-            held: What the hands hold.
+            held: Boxes that the hands hold.
 
         Returns:
             (h, w) pixels whose point lies in a link or in what is held, and their numbers by link or `held/NAME`.

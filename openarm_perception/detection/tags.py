@@ -69,7 +69,7 @@ class TagDetector:
     """Finds tags in a colour image.
 
     Args:
-        config: Which.
+        config: Family and size of the tags.
     """
 
     def __init__(self, config: TagConfig) -> None:

@@ -68,7 +68,7 @@ class CloudFrame:
     Attributes:
         frame: The frame; depths are not limited.
         T_base_camera: (4, 4) optical frame in that of the cloud, where its z is up; None: the cloud is of a camera.
-        note: How it was made, where it is no image as it is.
+        note: Note on how it was made, where it is no image as it is.
     """
 
     frame: Frame

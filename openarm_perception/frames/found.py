@@ -242,7 +242,7 @@ def followed(objects: Objects, found: Found, t_ns: int) -> tuple[Objects, Found]
 
     Args:
         objects: After the frame before.
-        found: What was found in the frame.
+        found: Objects of the frame.
         t_ns: Stamp of the frame.
     """
     T = np.eye(4) if found.T_base_camera is None else found.T_base_camera

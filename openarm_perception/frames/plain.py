@@ -42,7 +42,7 @@ def numbers(array: Any, path: Path, expected: str) -> NDArray[Any]:
     Args:
         array: Array of the file.
         path: Path of the file, for the error.
-        expected: What it should have, for the error.
+        expected: Expected content, for the error.
 
     Raises:
         OpenArmError: BAD_IMAGE, when it is none.

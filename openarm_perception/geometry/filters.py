@@ -135,8 +135,8 @@ def statistical_inliers(points: Points, neighbours: int = 20, deviations: float 
 
     Args:
         points: (n, 3), finite.
-        neighbours: How many nearest points count, the point itself among them.
-        deviations: How unusual is too much.
+        neighbours: Number of nearest points that count, the point itself among them.
+        deviations: Standard deviations from which on a distance is too large.
 
     Returns:
         (n,) mask; all True for fewer than three points.
@@ -157,8 +157,8 @@ def open3d_inliers(points: Points, neighbours: int = 20, deviations: float = 2.0
 
     Args:
         points: (n, 3), finite.
-        neighbours: How many nearest points count.
-        deviations: How unusual is too much.
+        neighbours: Number of nearest points that count.
+        deviations: Standard deviations from which on a distance is too large.
 
     Raises:
         OpenArmError: ENVIRONMENT, without open3d.
@@ -189,7 +189,7 @@ class CloudFilter:
     """The filters of a configuration.
 
     Args:
-        config: Which ones.
+        config: Filters and their settings.
 
     Raises:
         OpenArmError: ENVIRONMENT, when open3d is asked for and missing.

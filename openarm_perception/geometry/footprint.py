@@ -34,7 +34,7 @@ class Footprint:
         centre: (2,) m.
         yaw: Direction of the smaller extent, rad in (-pi/2, pi/2]; 0 for a circle.
         size: (smaller, larger) extent, m; the diameter twice for a circle.
-        rms: Of the distances from the outline to the fitted shape, m.
+        rms: Root mean square of the distances from the outline to the fitted shape, m.
         centre_std: Along the smaller and the larger extent, m.
         yaw_std: rad; that of any direction for a circle.
     """
@@ -81,7 +81,7 @@ def bound(points: Array, pixel: float, missing: float) -> Footprint:
     Args:
         points: Seen ones, m.
         pixel: Distance of neighbouring points across the view, m.
-        missing: By which the rectangle is larger, m: half a pixel is missing on every side that faces away.
+        missing: Length by which the rectangle is larger, m: half a pixel is missing on every side that faces away.
     """
     yaw = wall_yaw(points, max(_APART * pixel, _CELL))
     local = points @ _rotation(yaw)

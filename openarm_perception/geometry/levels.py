@@ -80,7 +80,7 @@ def find_levels(points: Array | NDArray[np.float32], apart: Mask, least: float) 
     Args:
         points: (h, w, 3) axes of the support: z is the height over it, m; NaN where nothing was measured.
         apart: (h, w) pixels of nothing that stands or carries, such as those of the robot.
-        least: What rises by less stands on nothing, m.
+        least: Least height: what rises by less stands on nothing, m.
     """
     face, under = (np.zeros(points.shape[:2], np.uint8) for _ in range(2))
     heights = [0.0]

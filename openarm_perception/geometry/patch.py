@@ -58,7 +58,7 @@ def cut(found: Detection2D, view: View, limits: DepthLimits, top_band: float, ta
     """Return the patch of a detection, without what stands on it.
 
     Args:
-        found: In the colour image.
+        found: Detection in the colour image.
         view: The frame; what is the robot is no part of the object, but may hide it.
         limits: Depths that count.
         top_band: Heights within this of the top are top where the depth is clean, m.
@@ -136,8 +136,8 @@ def keep_edges(z: Array | NDArray[np.float32], smooth: Array, noise: float, pixe
 
     Args:
         z: Depth as measured, m.
-        smooth: What `denoise` has made of it.
-        noise: That is left, m.
+        smooth: Result of `denoise`.
+        noise: Noise that is left, m.
         pixel: Metres across of a pixel at 1 m.
     """
     with np.errstate(invalid="ignore"):

@@ -33,7 +33,7 @@ class TableMeasurement:
         height: Height of the plane in the middle of its points, m.
         std: Rms distance of the points from the plane, m.
         tilt: Tilt of the plane against the horizontal, rad.
-        points: How many were used.
+        points: Number of points that were used.
         share: Share of all points that were seen.
     """
 
@@ -51,7 +51,7 @@ def measure_table(view: View, limits: DepthLimits, expected: float, pixels: int 
         view: The frame.
         limits: Depths that count.
         expected: Height of the table so far, m.
-        pixels: As many, spread over the image, are enough.
+        pixels: Number of pixels, spread over the image, that is enough.
 
     Raises:
         OpenArmError: BAD_IMAGE, when depth and intrinsics do not fit; NOTHING_DETECTED, when there is no such surface.

@@ -83,7 +83,7 @@ class CameraWatch:
         Args:
             t_ns: Stamp of the frame.
             view: The frame.
-            table_height: That is expected, base frame, m.
+            table_height: Height that is expected, base frame, m.
 
         Returns:
             INTRINSICS_MISMATCH or TABLE_MISMATCH once it is certain; NOTHING_DETECTED before, when the next frames may

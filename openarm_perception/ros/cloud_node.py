@@ -34,7 +34,7 @@ class _Camera:
     """The points of one camera, for its own cloud or for the merged one.
 
     Args:
-        node: That publishes them.
+        node: Node that publishes them.
         name: Name of the camera.
         finder: Finds the robot in images; None: it stays in the cloud.
         publish: Takes each frame and its points; what raises is reported.

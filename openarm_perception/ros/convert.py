@@ -26,7 +26,7 @@ def detections_2d(perceived: Perceived, frame_id: str, t_ns: int) -> Detection2D
     """Boxes by their centre, pixels; a box in an image has no pose, and no shape but that which a network knows.
 
     Args:
-        perceived: What was found in the image; what is not in space either has no id.
+        perceived: Objects of the image; what is not in space either has no id.
         frame_id: Frame of the image.
         t_ns: Stamp.
     """
@@ -61,7 +61,7 @@ def markers(located: Sequence[LocatedObject], frame_id: str, t_ns: int) -> Marke
     """Return a transparent body and a text for each object.
 
     Args:
-        located: In the frame.
+        located: Objects in the frame.
         frame_id: Frame of the poses.
         t_ns: Stamp.
     """

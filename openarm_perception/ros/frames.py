@@ -191,7 +191,7 @@ class FrameBuilder:
     Args:
         topics: Topics of the camera.
         limits: Depths that count.
-        chosen: What the topics do not say.
+        chosen: Settings that the topics do not give.
         pose: Returns the pose (4, 4) of the second frame in the first one; None, when it is not known.
 
     Attributes:

@@ -23,7 +23,7 @@ def noise_between(points: Points, background: Points, most: float) -> float:
     Args:
         points: (h, w, 3), m.
         background: (h, w, 3), m.
-        most: Of a depth at 1 m; what differs by three times as much is no background.
+        most: Noise of a depth at 1 m; what differs by three times as much is no background.
 
     Raises:
         OpenArmError: BAD_IMAGE, for a background of another size, or when hardly any pixel shows it.
@@ -49,7 +49,7 @@ def nearer(points: Points, background: Points, noise: float, sigmas: float, leas
         points: (h, w, 3), m.
         background: (h, w, 3), m; what has no depth there is not nearer.
         noise: Noise of a depth at 1 m, m.
-        sigmas: By so many standard deviations.
+        sigmas: Number of standard deviations.
         least: And by so much, m.
     """
     # neighbours count too: at steps of the background a pixel may show either side, or nothing

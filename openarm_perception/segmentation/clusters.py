@@ -35,7 +35,7 @@ class Cluster:
         points: (n, 3) float32 of those of its pixels that lie on a surface, without their noise, in row order, m; base
             frame, or the camera's where its pose is not known.
         height: Height of its highest place over the surface that it stands on, m.
-        outline: What lies beyond its outline.
+        outline: Neighbours beyond its outline.
         shape: Whether a prism fits it.
         T_frame_box: (4, 4) middle of the box around it, in the frame of the points; z away from the support.
         size: (3,) of that box, m; x is the smaller horizontal edge.
@@ -66,7 +66,7 @@ class Segmentation:
     Attributes:
         label: (h, w) uint16, 0: no thing; else the `id` of a cluster.
         clusters: Largest (area) first; their ids are 1, 2, …
-        support: What they stand on, or what carries them.
+        support: Surface that they stand on, or what carries them.
         heights: (h, w) float32 over it, m; NaN where nothing was measured.
     """
 
@@ -93,13 +93,13 @@ def segment(
     Args:
         points: (h, w, 3) float32, optical frame, m; NaN where nothing was measured.
         intrinsics: Intrinsics of the camera.
-        config: What counts as a thing.
+        config: Thresholds of what counts as a thing.
         rgb: (h, w, 3) uint8 aligned with it: clusters have a colour then.
         T_base_camera: (4, 4) optical frame in the base frame, whose z points up; None: the support may be slanted.
         robot: (h, w) pixels that show the robot or what it holds.
         background: (h, w, 3) as `points`, of the empty table or box; the support is found there, and what is no nearer
             than it is no thing.
-        support: What things stand on, where that is known.
+        support: Surface that things stand on, where it is known.
         levels: Surfaces over it that things stand on; None: they are searched.
 
     Raises:

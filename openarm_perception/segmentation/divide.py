@@ -85,7 +85,7 @@ class Divided:
         even: (h, w, 3) points without the noise of single pixels, optical frame, m.
         surface: (h, w, 3) such points that lie on a surface, also at its edges; NaN where a pixel floats between two.
         heights: (h, w) float32 of those over the support, m.
-        pieces: Of how many pieces each thing is, which its colours alone have joined.
+        pieces: Number of pieces of each thing, which its colours alone have joined.
         levels: Surfaces over the support that things stand on.
     """
 
@@ -112,8 +112,8 @@ def divide(
     Args:
         points: (h, w, 3) organised, optical frame, m.
         intrinsics: Intrinsics of the camera.
-        support: What things stand on.
-        config: What counts as a thing.
+        support: Surface that things stand on.
+        config: Thresholds of what counts as a thing.
         apart: (h, w) pixels of no thing, such as those of the robot.
         rgb: (h, w, 3) uint8; None: parts of one colour are not joined.
         levels: Surfaces over the support that things stand on; None: they are searched.

@@ -47,9 +47,9 @@ def joined(
     """Return the group (n,) of each cluster: the index of its first one.
 
     Args:
-        clusters: Of one image.
+        clusters: Clusters of one image.
         label: (h, w) their numbers 1, 2, … at each pixel, 0: none.
-        pieces: Of how many pieces each is already; none: of one.
+        pieces: Number of pieces of each so far; none: of one.
         carried: (n, n) which carry each other: these are no parts of one thing; None: none do.
     """
     root = np.arange(len(clusters))

@@ -64,7 +64,7 @@ def judge(mask: Mask, other: Mask, z: NDArray[np.float32], rays: Array, eye: flo
         z: (h, w) depth of the window, m.
         rays: (h, w, 3) directions of unit depth of the pixels: two along the plane, and up; the camera is at (0, 0).
         eye: Height of the camera over the plane, m.
-        hidden: What cuts its outline; a prism is not fitted to what is seen in part.
+        hidden: Neighbours that cut its outline; a prism is not fitted to what is seen in part.
         pixel: Metres across of a pixel at 1 m.
     """
     smooth, left = denoise(z.astype(np.float64), pixel)

@@ -73,8 +73,8 @@ class StereoMatcher:
     """Computes depth of the pairs of one rectification.
 
     Args:
-        config: How they are matched.
-        rectification: Of the pair.
+        config: Settings of the matching.
+        rectification: Rectification of the pair.
         limits: Depths that count; the nearest decides how many disparities are tried.
 
     Raises:

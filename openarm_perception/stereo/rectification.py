@@ -57,8 +57,8 @@ class Rectification:
     """Makes rectified pairs.
 
     Args:
-        left: Of the left camera.
-        right: Of the right camera.
+        left: Lens of the left camera.
+        right: Lens of the right camera.
 
     Attributes:
         intrinsics: Intrinsics of both rectified cameras.
@@ -102,8 +102,8 @@ class Rectification:
         """Rectify two cameras whose relative pose is known (Bouguet's algorithm, `cv2.stereoRectify`).
 
         Args:
-            left: Of the left camera.
-            right: Of the right camera.
+            left: Lens of the left camera.
+            right: Lens of the right camera.
             T_left_right: Optical frame of the right camera in that of the left, (4, 4), m.
 
         Raises:
