@@ -32,7 +32,7 @@ class Outcome:
         success: Whether what was asked happened.
         message: One sentence for people.
         code: Why it did not; OK when it did.
-        data: What `--json` writes in addition to success, code and message.
+        data: Data that `--json` writes in addition to success, code and message.
         text: Longer text for people (a table, a drawing), printed before the message.
     """
 

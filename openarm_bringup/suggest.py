@@ -17,7 +17,7 @@ def unknown(what: str, name: str, known: Iterable[str]) -> OpenArmError:
 
     Args:
         what: Kind of the name, such as "topic".
-        name: As it was given.
+        name: Name that was given.
         known: All that exist.
     """
     names = sorted(known)

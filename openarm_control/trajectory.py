@@ -87,7 +87,7 @@ class Trajectory:
         start_ns: Simulated time of the start; 0 is as soon as possible.
         path_tolerance: While moving.
         goal_tolerance: Tolerance at the end.
-        goal_time_s: Time after the end until the goal must be reached; 0: the controller's default, negative: unbounded.
+        goal_time_s: Time after the end in which it must be reached; 0: the controller's default, negative: no limit.
     """
 
     names: tuple[str, ...]

@@ -26,9 +26,9 @@ class EmulatedRobot(JointController):
 
     Args:
         description: The robot.
-        world: Whose actuators they are.
-        addresses: Of the bus of each arm.
-        clock: Of the motors' timeouts, ns.
+        world: World whose actuators they are.
+        addresses: Addresses of the bus of each arm.
+        clock: Clock of the motors' timeouts, ns.
 
     Attributes:
         buses: The motors, with their faults.

@@ -43,7 +43,7 @@ class PositionController:
     Args:
         names: Its joints.
         position: (k,) that it commands at first.
-        limit: Of the motors' position commands, +-rad.
+        limit: Limit of the motors' position commands, +-rad.
     """
 
     def __init__(self, names: Sequence[str], position: Array, limit: float = math.inf) -> None:
@@ -98,7 +98,7 @@ class OpenArmRos2(JointController):
     Args:
         description: The robot.
         joint_names: Order of the joints.
-        state: Where they are.
+        state: State of the joints.
     """
 
     def __init__(self, description: RobotDescription, joint_names: tuple[str, ...], state: JointReadout) -> None:

@@ -58,8 +58,8 @@ class SimulatedRobot(Generic[ControllerT]):
         Args:
             stage: Robot, cameras and physics.
             scene: Table and objects.
-            trajectory: How arms follow trajectories; None is the defaults.
-            gripper: How grippers move; None is the defaults.
+            trajectory: Settings of how arms follow trajectories; None is the defaults.
+            gripper: Settings of how grippers move; None is the defaults.
             servos: Servos of the arms as identified, by side; None is what the profile says of them.
 
         Raises:

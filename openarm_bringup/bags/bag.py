@@ -172,14 +172,14 @@ class Bag:
     """A bag that is open for reading; made by `open_bag`.
 
     Attributes:
-        path: As it was given.
+        path: Path that was given.
         topics: Type and offered quality of service of each topic whose messages are CDR of a ROS 2 type.
         counts: Messages by topic.
         left_out: Why messages are left out, by topic: of another encoding, or of another type than most of the topic.
-        custom: What was kept with it.
-        start_ns: Of the first message.
-        duration_s: To the last message.
-        mended: How many bytes of an unfinished file were given up; None for a bag that was closed in order.
+        custom: Custom data that was kept with it.
+        start_ns: Stamp of the first message.
+        duration_s: Time from the first message to the last.
+        mended: Bytes of an unfinished file that were given up; None for a bag that was closed in order.
     """
 
     def __init__(self, path: Path, files: Sequence[Storage], custom: Mapping[str, str]) -> None:

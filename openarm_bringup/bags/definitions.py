@@ -70,7 +70,7 @@ def event_definition(kind: str) -> str:
     """Return the text that rosbag2 keeps for the events of a service: its request and response.
 
     Args:
-        kind: As `is_event`; installed.
+        kind: Kind, same as for `is_event`; installed.
     """
     service = interface(kind.removesuffix(_EVENT))
     request, response = definition(service.Request), definition(service.Response)
@@ -107,7 +107,7 @@ def changed_type(recorded: MessageDefinition, kind: str) -> str:
     Constants are left out of it: they are not in the bytes of a message.
 
     Args:
-        recorded: As it is in a bag.
+        recorded: Definition that the bag has.
         kind: Kind of the messages, such as `sensor_msgs/msg/Image`; installed.
     """
     if len(recorded.data) > _LONGEST:

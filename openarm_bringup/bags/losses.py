@@ -24,7 +24,7 @@ class Arrivals:
 
         Args:
             sequence: Number that its publisher gave it.
-            publishers: How many the topic has now; called only when the number continues no known one.
+            publishers: Number of publishers of the topic; called only when the number continues no known one.
         """
         earlier = [number for number in self._last if number < sequence]
         before = sequence - 1

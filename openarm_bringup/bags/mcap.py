@@ -60,7 +60,7 @@ def unpack(data: bytes, size: int = MAX_UNPACKED, *, kind: str = "zstd") -> byte
 
     Args:
         data: Compressed.
-        size: That it may have, bytes.
+        size: Largest size, bytes.
         kind: `zstd` or `lz4`.
 
     Raises:

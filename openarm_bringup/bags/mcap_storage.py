@@ -43,8 +43,8 @@ class _Summary:
     """What a file repeats at its end.
 
     Attributes:
-        start: Where it starts; the end of the data.
-        chunks: By their place; each with the place after its indexes.
+        start: Offset at which it starts; the end of the data.
+        chunks: Chunks by their offset; each with the offset after its indexes.
         counts: Messages of each channel; empty where it does not say it.
         stamps: First and last, ns.
     """

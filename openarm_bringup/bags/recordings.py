@@ -50,7 +50,7 @@ class Recordings:
         """Write what a ring held; other paths than complete ones never appear. Then let the oldest give way.
 
         Args:
-            path: From `reserve`.
+            path: Path from `reserve`.
             moment: The messages.
             custom: Kept in the metadata.
 

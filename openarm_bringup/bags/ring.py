@@ -28,7 +28,7 @@ class Moment:
 
     Attributes:
         topics: Topics of the messages.
-        seconds: From the first message to the last, s.
+        seconds: Time from the first message to the last, s.
         packed: The messages in the order of their stamps, large ones compressed.
     """
 

@@ -45,7 +45,7 @@ class Channel:
         definition: Text that the recording has of the type.
         qos: Offered quality of service; None where the recording does not say it.
         count: Number of messages.
-        encoding: Of messages that are no CDR of a ROS 2 type, which nothing here can read; empty for the others.
+        encoding: Encoding of messages that nothing here can read: no CDR of a ROS 2 type; empty for the others.
     """
 
     number: int
@@ -69,10 +69,10 @@ class Storage(Protocol):
     """A file of a recording, open for reading.
 
     Attributes:
-        channels: In the order of their numbers.
+        channels: Channels in the order of their numbers.
         start_ns: Stamp of the first message.
         end_ns: Stamp of the last message; before `start_ns` where there is none.
-        custom: What was kept with the recording, where the file says it.
+        custom: Custom data of the recording, where the file has it.
         given_up: Bytes after the last whole record; None for a file that was closed in order.
     """
 

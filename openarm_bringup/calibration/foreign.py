@@ -36,7 +36,7 @@ def imported(path: Path, given: Foreign) -> Outcome:
         given: Options of the command line.
 
     Raises:
-        OpenArmError: What is wrong with file or options; DEGENERATE, when the poses determine nothing.
+        OpenArmError: Fault of file or options; DEGENERATE, when the poses determine nothing.
     """
     from openarm_bringup.bags.files import is_recording
     from openarm_calibration.foreign.explain import Unexplained, table

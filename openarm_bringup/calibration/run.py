@@ -105,14 +105,14 @@ class CalibrationRun:
     """What came of it; a session file of each scene is in the run folder.
 
     Args:
-        run_dir: Of the graph; None: it runs on.
-        results: By camera, in the order of the work; with the board in the first hand.
+        run_dir: Folder of the graph's run; None: it runs on.
+        results: Results by camera, in the order of the work; with the board in the first hand.
         sessions: Files of samples.
         found: Zeros and all mounts, where they were to be determined.
         stored: Files that they were stored in.
         ready_s: Until the graph was ready.
         robot_s: The arms moved and samples were taken, s of wall clock.
-        error: That ended it.
+        error: Error that ended it.
     """
 
     run_dir: Path | None
@@ -158,7 +158,7 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
     """Calibrate; the graph is stopped whatever happens.
 
     Raises:
-        OpenArmError: What is wrong with the options; what happens later is in the result.
+        OpenArmError: Fault of the options; what happens later is in the result.
     """
     cameras = chosen_cameras(options.cameras)
     domain = reserve_domain() if options.domain is None else options.domain

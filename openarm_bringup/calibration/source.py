@@ -80,7 +80,7 @@ def with_solved(
         free_intrinsics: Estimate the intrinsics, too.
 
     Raises:
-        OpenArmError: What is wrong with the file or the options; DEGENERATE, when a session determines nothing.
+        OpenArmError: Fault of the file or the options; DEGENERATE, when a session determines nothing.
     """
     from openarm_calibration.handeye.closed_form import REFINED
     from openarm_calibration.handeye.offline import calibrate, checked_algorithm
@@ -113,7 +113,7 @@ def opened(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str, A
         Samples, their hash, what became of the images of a bag, and the same as text.
 
     Raises:
-        OpenArmError: What is wrong with the file or the options.
+        OpenArmError: Fault of the file or the options.
     """
     from openarm_bringup.bags.files import is_recording
     from openarm_calibration.handeye.offline import without_named

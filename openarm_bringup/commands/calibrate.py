@@ -44,10 +44,10 @@ def board(out: Path, *, board: str = "circles", dpi: int = 300) -> Outcome:
 
     Args:
         out: File to write; its ending chooses the form.
-        board: In a word, such as circles:4x11:20mm:15mm, symmetric_circles:7x6:30mm:15mm, chessboard:8x5:25mm,
+        board: Board in a word, such as circles:4x11:20mm:15mm, symmetric_circles:7x6:30mm:15mm, chessboard:8x5:25mm,
             charuco:7x5:34mm:26mm:DICT_5X5_100, aprilgrid:6x6:24mm:0.3 or marker:100mm:DICT_APRILTAG_36h11:id=0; or its
             keys as YAML, or a YAML file, also of Kalibr.
-        dpi: Of a PNG.
+        dpi: Resolution of a PNG.
     """
     from openarm_calibration.board.board_files import write_board
 
@@ -96,7 +96,7 @@ def check(
     Args:
         samples: Session file (.npz), or a bag: folder of rosbag2, .mcap or .db3.
         touches: CSV file of `openarm calibrate touch`.
-        tip: That touched, in the frame of the tool centre point, m.
+        tip: Tip that touched, in the frame of the tool centre point, m.
         steady: Standard deviation of a touch by axis, m.
     """
     compare = calibrate_touch.comparison(touches, tip, steady) if touches is not None else None
@@ -114,7 +114,7 @@ def save(samples: Path, *, algorithm: str = "REFINED", force: bool = False, sour
 
     Args:
         samples: Session file (.npz), or a bag: folder of rosbag2, .mcap or .db3.
-        algorithm: As for `solve`.
+        algorithm: Same as for `solve`.
         force: Store also what fails the limits.
     """
     place = store_in(source.store)
@@ -218,7 +218,7 @@ def rollback(name: str, *, store: Path | None = None) -> Outcome:
     """Go back to what was stored before the present one; with zeros, to the mounts of before.
 
     Args:
-        name: What `list` begins the line with: a camera, table, zeros, hands or servos/ARM; of a simulated robot such
+        name: First word of a line of `list`: a camera, table, zeros, hands or servos/ARM; of a simulated robot such
             as hands/simulated_openarm.
         store: Folder of stored calibrations.
     """

@@ -38,8 +38,8 @@ def export(
 
     Args:
         format: YAML of easy_handeye2, a node of a launch file, link and fixed joint of a URDF, or camera_info.
-        camera: Whose; needed when several are stored.
-        frame: Which frame of the camera is placed: link (x forward) or optical (z forward; of easy_handeye2).
+        camera: Camera; needed when several are stored.
+        frame: Frame of the camera that is placed: link (x forward) or optical (z forward; of easy_handeye2).
         child: Name of that frame; as of this suite's cameras when not given.
         out: File to write.
         store: Folder of stored calibrations.

@@ -57,8 +57,8 @@ def auto(
         store: Folder of stored calibrations.
         delay: Also measure how old images are at their stamps.
         running: Use the graph that runs, with the board in place, instead of a simulated one; of one camera.
-        carrier: With --running: link that holds the board of a fixed camera; the last arm's flange when not given.
-        session: With --running: file (.npz) to write the samples to, for `openarm calibrate zeros`.
+        carrier: Link that holds the board of a fixed camera, with --running; the last arm's flange when not given.
+        session: File (.npz) to write the samples to, for `openarm calibrate zeros`; with --running.
         domain: ROS_DOMAIN_ID; a free one, or that of the running graph, when not given.
     """
     choose_robot(robot)
@@ -134,8 +134,8 @@ def table(
     """Measure the height of the table in the running graph and store it; every node takes it over at once.
 
     Args:
-        camera: Whose depth is used; that of the camera over the table when not given.
-        block_height: Of a block that stands on the table, m, whose top is measured instead of the table's surface.
+        camera: Camera whose depth is used; that of the camera over the table when not given.
+        block_height: Height of a block on the table, m, whose top is measured instead of the table's surface.
         label: Label of that block, when several objects are in view.
         dry_run: Measure, and store nothing.
     """
@@ -168,8 +168,8 @@ def dynamics(*, arm: str = "both", postures: int = 6, dry_run: bool = False, dom
     carries the arms by what is stored from then on.
 
     Args:
-        arm: Which, or both.
-        postures: In which it moves; more are slower and more exact.
+        arm: Arm, or both.
+        postures: Number of postures in which it moves; more are slower and more exact.
         dry_run: Identify, and store nothing.
     """
     join_graph(domain)

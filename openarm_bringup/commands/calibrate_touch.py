@@ -29,7 +29,7 @@ def touch(file: Path, *, mark: int, arm: str = "", domain: Domain = None, robot:
     Args:
         file: CSV file that the touch is added to.
         mark: Number of the mark.
-        arm: Which arm; needed when there are several.
+        arm: Arm; needed when there are several.
     """
     choose_robot(robot)
     from openarm_calibration.handeye.touch import Touch, add_touch
@@ -53,7 +53,7 @@ def comparison(file: Path, tip: Point, steady: float) -> Callable[[Solved, Outco
 
     Args:
         file: CSV file of touches.
-        tip: That touched, in the frame of the tool centre point, m.
+        tip: Tip that touched, in the frame of the tool centre point, m.
         steady: Standard deviation of a touch by axis, m.
 
     Raises:

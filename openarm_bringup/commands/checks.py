@@ -87,7 +87,7 @@ def completion(shell: Literal["bash", "zsh", "fish"] = "bash", *, install: bool 
     """Print what makes a shell complete this command line, as in: eval "$(openarm completion bash)".
 
     Args:
-        shell: Which shell.
+        shell: Shell.
         install: Write it where the shell finds it, for every new shell, instead of printing it.
     """
     from openarm_bringup.cli import build_app

@@ -32,7 +32,7 @@ def release(*, arm: str = "", domain: Domain = None) -> Outcome:
     """Open a hand where it is: what it holds falls from there. `openarm pick --phase place` puts it down instead.
 
     Args:
-        arm: Which; when not given, of the one that holds something.
+        arm: Arm of the hand; when not given, of the one that holds something.
     """
     join_graph(domain)
     check_arms(arm)

@@ -62,7 +62,7 @@ def set_id(bus: str, motor: int, *, to: int = 0) -> Outcome:
     """Set the ids of a motor, and read them back; it keeps them without power. Connect new motors one by one.
 
     Args:
-        bus: As of `scan`.
+        bus: Same as for `scan`.
         motor: Its present id.
         to: Its new one; 0: it keeps it, and only its replies get the id that hardware.yaml expects.
     """
@@ -120,8 +120,8 @@ def jog(joint: str, degrees: float, *, emulated: Emulated = False) -> Outcome:
 
     Args:
         joint: Its name.
-        degrees: How far, up to 30 either way.
-        emulated: As of `zero`.
+        degrees: Angle, up to 30 either way.
+        emulated: Same as for `zero`.
     """
     from openarm_common.collision.self_collision import SelfCollision
     from openarm_common.motors.wiring import load_wiring
@@ -192,7 +192,7 @@ def record_gains(out: Path, *, against: Path | None = None, emulated: Emulated =
     Args:
         out: JSON file.
         against: An earlier record; what differs is listed, as after an exchange of a motor or its firmware.
-        emulated: As of `zero`.
+        emulated: Same as for `zero`.
     """
     from openarm_common.motors.wiring import load_wiring
     from openarm_common.robot.folder import robot_name

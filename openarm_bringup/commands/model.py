@@ -35,7 +35,7 @@ def write(
         render: PNG file for a picture of the robot in a scene.
         scene: mjcf and picture: name or path of a scene to put around the robot, or "random".
         seed: Seed of a random scene.
-        view: Of the picture: front, three_quarter, side, back, top, or the name of a camera.
+        view: View of the picture: front, three_quarter, side, back, top, or the name of a camera.
     """
     choose_robot(robot)
     from openarm_sim_bridge.world.export import export, render_png

@@ -22,7 +22,7 @@ def ps(*, seconds: float = 0.3) -> Outcome:
     """List the running graphs: CPU and memory of each node (and of what it has started), and what it says is wrong.
 
     Args:
-        seconds: How long the CPU is measured.
+        seconds: Time for which the CPU is measured, s.
     """
     from openarm_bringup.supervision import runs
 
@@ -94,7 +94,7 @@ def logs(
     Args:
         node: Name of the node, or "supervisor"; without one, the logs are listed.
         follow: Go on with what is added, until Ctrl-C.
-        lines: How many lines from the end to begin with.
+        lines: Number of lines from the end to begin with.
         run: Name of a run below runs/.
     """
     folder = _log_folder(run, node)

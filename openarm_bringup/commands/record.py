@@ -28,7 +28,7 @@ def record(
 
     Args:
         bag: Folder to make; bag_DATE_TIME when not given.
-        profile: What to record: grasp (cameras, robot, detections, grasp), camera (cameras, robot), all.
+        profile: Topics to record: grasp (cameras, robot, detections, grasp), camera (cameras, robot), all.
         topics: Regular expressions of topic names, instead of a profile.
         duration: End after this long, s of wall clock; 0 waits for Ctrl-C.
         image_rate: Keep at most this many frames a second of each camera; 0 keeps all.
@@ -103,7 +103,7 @@ def replay(
         loop: Begin again at the end, until Ctrl-C.
         topics: Only these.
         remap: FROM:=TO of topic names; may be given several times.
-        until_idle: At the end, wait until what the graph publishes has ceased for a second.
+        until_idle: Wait at the end until what the graph publishes has ceased for a second.
     """
     if rate < 0.0 or start < 0.0 or duration < 0.0:
         raise OpenArmError(

@@ -121,7 +121,7 @@ def hz(name: str, *, seconds: float = 5.0, domain: Domain = None) -> Outcome:
 
     Args:
         name: Name of the topic.
-        seconds: How long.
+        seconds: Time to listen, s.
     """
     from statistics import median
 
@@ -179,7 +179,7 @@ def pub(
         name: Name of the topic.
         message: Its fields, such as "{name: [a], position: [0.1]}"; what is left out keeps its default. As with ros2,
             the type may precede it.
-        type_: Of the message, where no other node has the topic.
+        type_: Type of the message, where no other node has the topic.
         rate: Hz of a stream, until Ctrl-C, or for as long or as often as is said; 10 where only that is said.
         duration: End after this time, s.
         count: End after this many messages.
@@ -424,7 +424,7 @@ def param_set(node: str, name: str, value: str, *, domain: Domain = None) -> Out
     Args:
         node: Name of the node.
         name: Name of the parameter.
-        value: As YAML.
+        value: Value as YAML.
     """
     from openarm_common.config import parse_yaml
 

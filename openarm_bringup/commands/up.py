@@ -45,7 +45,7 @@ def up(
         discovery: Reach of discovery; localhost when the graph says nothing else.
         viz: Offer every topic and service to Foxglove, at an address that is printed.
         viz_port: TCP port for that.
-        emulate: Of the graph real: the simulated robot in place of motors and cameras, frame by frame.
+        emulate: Run the graph real on the simulated robot in place of motors and cameras, frame by frame.
         moveit: Answer clients of MoveIt, too (nodes move_group and servo_node). The first time builds moveit_msgs.
     """
     choose_robot(robot)

@@ -41,10 +41,10 @@ class Finding:
     """Result of one check.
 
     Args:
-        name: What was checked.
+        name: Name of the check.
         level: ok, note (works, with a limitation) or error (will not work).
-        observed: What was found.
-        advice: What to do; empty when nothing.
+        observed: Observation, in words.
+        advice: Advice; empty when there is nothing to do.
     """
 
     name: str

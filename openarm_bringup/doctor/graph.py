@@ -31,7 +31,7 @@ class GraphStatus:
 
     Args:
         rates: Hz by topic, of those of RATES that have a publisher.
-        diagnostics: By node: whether it reports OK on /diagnostics, and its message.
+        diagnostics: Report on /diagnostics by node: whether it is OK, and its message.
         nodes: Names of all discovered nodes, one entry a participant.
     """
 

@@ -27,7 +27,7 @@ def check_can(address: str, sys: Path, link: Mapping[str, Any] | None, *, flexib
     Args:
         address: Address of hardware.yaml.
         sys: /sys.
-        link: What `ip -details -statistics -json link show NAME` says of it; None without `ip`.
+        link: Output of `ip -details -statistics -json link show NAME`; None without `ip`.
         flexible: Whether frames are sent as CAN FD.
     """
     name = address.partition(":")[2]

@@ -74,7 +74,7 @@ def frame_of_graph(chosen: CameraChoice, timeout: float) -> Frame:
     """Return the next frame of a camera of the running graph.
 
     Args:
-        chosen: Which camera.
+        chosen: Name of the camera.
         timeout: Longest wait for topics, and for the frame, s.
 
     Raises:
@@ -89,7 +89,7 @@ def frames_of_bag(path: Path, chosen: CameraChoice, start_s: float, count: int =
 
     Args:
         path: Folder of rosbag2, or a file of it.
-        chosen: Which camera.
+        chosen: Name of the camera.
         start_s: Only from this long after the first message on.
         count: Most frames.
 

@@ -43,9 +43,9 @@ class Peer(ContextNode):
     """A hidden node; a context manager, in which the nodes that run are discovered.
 
     Args:
-        context: Of `new_context`, where many peers share what is discovered; without it one of its own.
+        context: Context from `new_context`, where many peers share what is discovered; without it one of its own.
         check: Called whenever it waits; what it raises is raised there.
-        settled: What is discovered is not still growing.
+        settled: True once what is discovered does not grow any more.
 
     Raises:
         OpenArmError: NOT_READY, on entering, when no node runs.
@@ -199,7 +199,7 @@ class Frames:
 
     Attributes:
         edges: Parent, pose in it and whether it is fixed, of each frame.
-        clashes: What is wrong with a frame that has more than one publisher or parent, by its name.
+        clashes: Fault of a frame that has more than one publisher or parent, by its name.
     """
 
     def __init__(self) -> None:

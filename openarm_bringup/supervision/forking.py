@@ -22,8 +22,8 @@ class ForkServer:
     """The supervisor's end of a fork server.
 
     Args:
-        channel: To the server.
-        process: That it runs in.
+        channel: Channel to the server.
+        process: Process that it runs in.
     """
 
     def __init__(self, channel: socket.socket, process: NodeProcess) -> None:
@@ -37,7 +37,7 @@ class ForkServer:
 
         Args:
             env: Environment of the server; libraries read it when they are imported.
-            log: For what the server itself prints.
+            log: File for the output of the server itself.
 
         Raises:
             OpenArmError: ENVIRONMENT, when it can't be started.

@@ -214,7 +214,7 @@ def load_graph(
         name: Name of a graph of the suite, or path of a file.
         overrides: Top-level values (scene, seed, mount_seed, domain, discovery); None leaves the file's value.
         sets: `node.param=value`, the value as YAML.
-        emulate: With what the file says in `emulate`.
+        emulate: True for the graph with what the file says in `emulate`.
 
     Raises:
         OpenArmError: CONFIG_INVALID for a fault in a file (named as file:key); INVALID_ARGUMENT for one in `sets`,

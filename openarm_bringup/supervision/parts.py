@@ -19,7 +19,7 @@ def for_each_part(document: Any) -> Any:
     """Return the content of a graph file for the robot of this process.
 
     Raises:
-        OpenArmError: As `load_folder` and `load_cameras`, when the file speaks of parts.
+        OpenArmError: Same as `load_folder` and `load_cameras`, when the file speaks of parts.
     """
     if not any(mark in str(document) for mark in ("${arm}", "${camera}", "${hand_camera}")):
         return document

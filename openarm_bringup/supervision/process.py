@@ -83,7 +83,7 @@ class NodeProcess:
 
         Args:
             start: Does it.
-            log: For what the process prints.
+            log: File for the output of the process.
 
         Raises:
             OpenArmError: ENVIRONMENT, when it can't be started.

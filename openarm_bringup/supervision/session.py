@@ -29,7 +29,7 @@ async def running_graph(
     environment.
 
     Args:
-        graph: What to run.
+        graph: Graph to run.
         run_dir: Folder for logs and parameters.
         listener: Is called with every change of a node.
         ends: After the block this process ends, as `Supervisor.stop` says.

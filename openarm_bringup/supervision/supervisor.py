@@ -52,7 +52,7 @@ class Supervisor:
     """Runs one graph; made inside a running asyncio loop.
 
     Args:
-        graph: What to run.
+        graph: Graph to run.
         run_dir: Gets `logs/<node>.log`, `logs/supervisor.log` and `params/`.
         probe: Makes the probe; called in a thread, because it imports rclpy.
         listener: Is called with every change of state.

@@ -24,7 +24,7 @@ async def listening(app: web.Application, host: str, port: int, shutdown_s: floa
     When there are `MOST` connections, a new one takes the place of the oldest whose request has not come yet.
 
     Args:
-        app: What answers.
+        app: Application that answers.
         host: Address to listen on.
         port: TCP port; 0 takes any that is free.
         shutdown_s: Longest wait for what is being answered at the end.
@@ -52,7 +52,7 @@ class Gate(asyncio.Protocol):
 
     Args:
         inner: Serves it.
-        gates: Of all connections, the oldest first.
+        gates: Gates of all connections, the oldest first.
     """
 
     def __init__(self, inner: asyncio.Protocol, gates: dict[Gate, None]) -> None:

@@ -27,7 +27,7 @@ class Guard:
     Args:
         host: Address or name that the server listens on.
         origins: Pages of others that may speak to it too, such as `https://app.example.org`.
-        token: What a caller must know; a new one by default.
+        token: Token that a caller must know; a new one by default.
     """
 
     def __init__(self, host: str = LOOPBACK, *, origins: Iterable[str] = (), token: str | None = None) -> None:

@@ -106,7 +106,7 @@ class ViewServer:
 
     Args:
         guard: Authorises requests.
-        hello: What a page gets first: the robot, the cameras, the states of a grasp.
+        hello: First message to a page: the robot, the cameras, the states of a grasp.
         meshes: And then, a frame: those of the robot.
         view: Observes the graph; its methods but `want` block, and are called in threads.
     """

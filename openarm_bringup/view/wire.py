@@ -109,11 +109,11 @@ def thin_cloud(
     """Points (n, 3) of a depth image in the base frame, thinned, and their colours (n, 3).
 
     Args:
-        deprojector: With the limits of the camera.
+        deprojector: Deprojector with the limits of the camera.
         depth: (h, w), uint16 mm or float32 m.
         rgb: (h, w, 3) of the same frame.
         intrinsics: Intrinsics of both.
-        T_base_optical: Where the camera is.
+        T_base_optical: Pose of the camera.
         edge: One point is kept for each cell of this edge, m.
         stride: Step between the pixels that are used, along rows and columns.
 

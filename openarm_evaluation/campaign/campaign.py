@@ -58,7 +58,7 @@ def run_campaign(
     """Run all seeds that the folder has no row of, and write the reports; Ctrl-C keeps what is done.
 
     Args:
-        options: What is run.
+        options: Campaign to run.
         folder: Folder of the campaign.
         on_row: Called with each new row.
         on_begin: Called with the number of rows that are there already.

@@ -38,7 +38,7 @@ class DynamicsBench:
     """The simulated robot alone, moved to show its servos.
 
     Args:
-        hardware: Of the robot.
+        hardware: Hardware of the robot.
     """
 
     def __init__(self, hardware: HardwareConfig) -> None:
@@ -99,7 +99,7 @@ def with_servos(task: Task, options: CampaignOptions, folder: Path) -> tuple[Tas
 
     Args:
         task: The task.
-        options: Of the campaign; None for the servos where they are not identified, or need not be: they carry the arm.
+        options: Options of the campaign; None for the servos where they are not identified, or need not be.
         folder: Folder of identifications; those that it lacks are made.
     """
     seed = options.dynamics_seeds[task.seed % len(options.dynamics_seeds)]

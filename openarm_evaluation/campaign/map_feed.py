@@ -22,7 +22,7 @@ class SimulatedMap:
     Args:
         description: The robot.
         config: Parameters of the octomap node.
-        cameras: At their mounts as the suite believes, by name.
+        cameras: Cameras by name, at the mounts that the suite believes in.
     """
 
     def __init__(

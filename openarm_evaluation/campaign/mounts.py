@@ -49,9 +49,9 @@ def with_mounts(
 
     Args:
         task: The task.
-        mount_seeds: To go through.
+        mount_seeds: Mount seeds to go through.
         folder: Folder of calibrations; those that it lacks are made.
-        hardware: Of the robot that calibrates.
+        hardware: Hardware of the robot that calibrates.
     """
     seed = mount_seeds[task.seed % len(mount_seeds)]
     robot = f"_zeros_{hardware.zero_seed}" if hardware.zero_rms else ""
@@ -80,10 +80,10 @@ class Bench:
     """One camera of the simulated robot with a board in front of it, without dynamics.
 
     Args:
-        camera: Which.
+        camera: Name of the camera.
         seed: Seed of the true mounts.
-        zeros: What is added to true joint positions, rad by name.
-        arm: That holds the board of a fixed camera; "": the last one.
+        zeros: Offsets that are added to true joint positions, rad by name.
+        arm: Arm that holds the board of a fixed camera; "": the last one.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Bench:
         """Take `count` samples.
 
         Raises:
-            OpenArmError: From the detector, or INVALID_ARGUMENT, when the board is hardly ever visible.
+            OpenArmError: Error of the detector, or INVALID_ARGUMENT, when the board is hardly ever visible.
         """
         lower, upper = self._description.limits(self.samples.joint_names, np.pi)
         middle, missed = self._middle(), list[OpenArmError]()

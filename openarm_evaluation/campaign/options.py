@@ -70,14 +70,14 @@ class CampaignOptions:
         profile: Motors of the arms: openarm as owners have them, or ideal.
         hardware: simulated, or emulated: openarm_hardware before motors that take frames, through the graph alone.
         dynamics_seeds: Motors, masses and joint zeros to go through with the profile openarm, such as 1-10.
-        controllers: Of the robot: suite, or openarm_ros2 with the profile openarm, through the graph alone.
+        controllers: Controllers of the robot: suite, or openarm_ros2 with the profile openarm, through the graph alone.
         hand_seeds: Stops and friction of the fingers to go through, such as 1-10; each hand is learned first. Those of
             the drawing when not given.
         identify: Whether the servos of each draw are identified first.
         use_effort: Whether the force of the fingers counts as evidence.
         objects: Of the suites objects and heap: a folder of object folders, or superquadrics:N; those of models/objects
             when not given.
-        detector: What finds objects: their colour, the network, both checking each other, a tag on them, or depth
+        detector: Detector of objects: their colour, the network, both checking each other, a tag on them, or depth
             (anything). Colour, and depth in the suites objects and heap, when not given.
         parameters: A parameter of a node of the graph `sim`, as node.param=value; may be given several times.
         ray: Address of a Ray cluster, such as HOST:6379 or auto, whose machines run the workers.

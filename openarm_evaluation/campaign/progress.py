@@ -26,7 +26,7 @@ class Watch(Progress):
 
     Args:
         total: Rows in all.
-        console: Where.
+        console: Console to write to.
     """
 
     def __init__(self, total: int, console: Console) -> None:

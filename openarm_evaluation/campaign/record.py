@@ -35,7 +35,7 @@ class Keeper:
     """Collects while a task runs; writes nothing unless it is asked to.
 
     Args:
-        robot: That the task runs on.
+        robot: Robot that the task runs on.
         folder: Folder of this task.
     """
 

@@ -123,7 +123,7 @@ class Known:
     Args:
         mounts: T_parent_link (4, 4) by camera.
         servos: Servos of the arms as identified, by side; None: as the profile says.
-        hands: As they were learned, by arm.
+        hands: Hands by arm, as learned.
     """
 
     mounts: Mapping[str, Array] = field(default_factory=dict[str, Array])
@@ -139,13 +139,13 @@ class SimRobot:
     """One world and all that moves and watches it. One thread.
 
     Args:
-        scene: What is on the table.
-        senses: How well it sees.
+        scene: Scene with the objects on the table.
+        senses: Noise and settings of the cameras and detectors.
         mount_seed: Seed of the true camera mounts; None mounts them where the configuration says.
         dynamics_seed: Seed of motors, masses and joint zeros; None: that of the configuration.
         hand_seed: Seed of stops and friction of the fingers; None: that of the configuration.
-        known: What the suite has found of it.
-        table: As the suite believes; None: as it is.
+        known: Calibration of the robot by the suite.
+        table: Table that the suite believes in; None: the true one.
         seed: Seed of the noise.
         posture: Joints that start elsewhere than at home, rad by name.
     """

@@ -31,7 +31,7 @@ def chaos(
     The same seed gives the same requests and faults.
 
     Args:
-        minutes: How long; a request that has begun is finished.
+        minutes: Duration; a request that has begun is finished.
         seed: Seed of scenes, requests and faults.
         faults: Kinds of faults: kill, stop, commands, services, disk, camera, joints, detector, plans, intruder,
             rival; all when not given; none.

@@ -73,7 +73,7 @@ def train(
         steps: Batches; fewer when the selection set gets no better.
         rate: Learning rate; 1e-3 with few pictures of your own.
         batch: Pictures a batch.
-        threads: Of torch.
+        threads: Threads of torch.
         seed: Seed of weights, order and variations.
         first: Weights to begin with: the best.pt of another run of the same classes.
         name: Name of the ONNX files.

@@ -60,7 +60,7 @@ def draw(*sources: str, out: Path = Path("objects.png"), side: int = 0, parts: b
     Args:
         sources: Names in models/objects, paths of folders, or superquadric:SEED.
         out: Picture, PNG.
-        side: That each rests on, the most frequent is 0.
+        side: Side that each rests on, the most frequent is 0.
         parts: Draw the convex parts instead of what is seen.
     """
     from openarm_common.objects.model import object_names

@@ -39,7 +39,7 @@ class SpareProcess:
     It has imported what drawing needs, so that the first images come a second sooner.
 
     Args:
-        serve: What it runs, given its end of the socket.
+        serve: Function that it runs, given its end of the socket.
     """
 
     def __init__(self, serve: Callable[[socket.socket], None]) -> None:

@@ -21,9 +21,9 @@ class SimulatedCameras:
 
     Args:
         renderer: Makes (or returns) what draws clean pictures; called at the first `load`.
-        cameras: By name.
-        depth_noise: Of depth images.
-        colour_noise: Of colour images.
+        cameras: Cameras by name.
+        depth_noise: Noise of depth images.
+        colour_noise: Noise of colour images.
         rng: Source of all noise.
 
     Attributes:

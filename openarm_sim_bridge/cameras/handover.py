@@ -37,9 +37,9 @@ class CameraSetup:
         cameras: All cameras.
         depth_encoding: Whole millimetres, or metres.
         topics: Name on the graph of each topic, by its name without remapping.
-        depth_noise: Of depth images.
-        colour_noise: Of colour images.
-        noise_seed: Of all noise.
+        depth_noise: Noise of depth images.
+        colour_noise: Noise of colour images.
+        noise_seed: Seed of all noise.
     """
 
     cameras: tuple[CameraConfig, ...]
@@ -57,7 +57,7 @@ class CameraReport:
     Attributes:
         ready: A frame of every camera was drawn, it can begin.
         fault: Why it can't draw.
-        rates: At which a camera is subscribed to, Hz: infinite: all its frames; 0: no subscriber needs one.
+        rates: Rates that a camera is subscribed to at, Hz: infinite: all its frames; 0: no subscriber needs one.
         rendered: Frames drawn so far, by camera.
         dropped: Frames that newer ones replaced before they were drawn.
         draw_ms: Mean time of the frames drawn since the last report.
@@ -88,7 +88,7 @@ class StateSender:
 
     Args:
         end: Socket of `pair`.
-        setup: For the other side.
+        setup: Set-up for the other side.
     """
 
     def __init__(self, end: socket.socket, setup: CameraSetup) -> None:

@@ -79,7 +79,7 @@ class SnapshotRenderer:
     """Draws snapshots; belongs to the thread that made it.
 
     Args:
-        cameras: By the names that the cameras have in the model.
+        cameras: Cameras by the names that they have in the model.
 
     Raises:
         OpenArmError: ENVIRONMENT, when there is no OpenGL.

@@ -40,7 +40,7 @@ def add_stand(
         robot: The same, read.
         base: Link to add, on the floor.
         place: Place of the robot, in the frame of the base.
-        turn: Of it about z, rad.
+        turn: Turn of it about z, rad.
     """
     T = se3.make(se3.rot_z(turn), place)
     if robot.root != WORLD:

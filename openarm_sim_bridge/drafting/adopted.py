@@ -40,8 +40,8 @@ class AdoptedUrdf:
     Args:
         source: URDF, or xacro.
         folder: Folder of the draft.
-        edits: Of joints and `hulls`; where the robot stands is added by the draft.
-        arguments: Of xacro, by name.
+        edits: Edits of joints and `hulls`; where the robot stands is added by the draft.
+        arguments: Arguments of xacro, by name.
         packages: Folders of packages by name.
 
     Raises:

@@ -88,7 +88,7 @@ class LinkContacts:
         """Return the pairs of links that touch in every random state.
 
         Args:
-            share: Of the states, in which they touch at least.
+            share: Share of the states in which they touch, at least.
             held: Positions of joints that stay there.
         """
         left = dict.fromkeys(self._pairs, round((1.0 - share) * _ALWAYS))

@@ -59,7 +59,7 @@ class Draft:
 
     Attributes:
         reasons: Why each pair of links in the SRDF may touch.
-        remarks: What was left out or guessed, a sentence each.
+        remarks: Parts that were left out or guessed, a sentence each.
     """
 
     reasons: Mapping[frozenset[str], str]
@@ -80,12 +80,12 @@ def draft_folder(
     A draft that fails leaves nothing.
 
     Args:
-        folder: To make; what it is called is the robot's name.
+        folder: Folder to make; its name is the robot's.
         source: MJCF (`.xml`), URDF, or xacro (`.xacro`).
-        arms: By name: link that the arm stands on, and link of its tool centre point.
+        arms: Arms by name: link that the arm stands on, and link of its tool centre point.
         edits: YAML of `Edits`.
         samples: Random states of the collision matrix, unless the folder has a `semantics.yaml` already.
-        arguments: Of xacro, by name.
+        arguments: Arguments of xacro, by name.
         packages: Folders of packages that a URDF names, by name.
 
     Raises:

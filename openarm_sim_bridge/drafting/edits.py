@@ -21,8 +21,8 @@ class BoxEdit(Config):
     Attributes:
         name: Name of the element.
         size: Full edges.
-        xyz: Of its middle, in the frame of the link.
-        material: Of a visual.
+        xyz: Position of its middle, in the frame of the link.
+        material: Material of a visual.
     """
 
     name: str
@@ -36,8 +36,8 @@ class FrameEdit(Config):
 
     Attributes:
         parent: Link that it is fixed to.
-        xyz: Of its origin.
-        rpy: Of its axes.
+        xyz: Position of its origin.
+        rpy: Orientation of its axes.
         site: Site of the MJCF that it is at, in place of the above.
         camera: Camera of the MJCF that it is at, z forward, y down.
     """
@@ -60,10 +60,10 @@ class AttachEdit(Config):
 
     Attributes:
         file: Path, from the folder of the robot's MJCF.
-        body: That carries it.
+        body: Body that carries it.
         prefix: Prefix of its names.
-        xyz: Of its origin, in the frame of the body.
-        rpy: Of its axes.
+        xyz: Position of its origin, in the frame of the body.
+        rpy: Orientation of its axes.
     """
 
     file: str
@@ -77,7 +77,7 @@ class MimicEdit(Config):
     """The position of a joint follows another: `multiplier` times it, plus `offset`.
 
     Attributes:
-        joint: That it follows.
+        joint: Joint that it follows.
         multiplier: rad/rad, or m/m.
         offset: rad, or m.
     """
@@ -95,22 +95,22 @@ class Edits(Config):
     Attributes:
         base: Link that has what the MJCF fixes to the world.
         prefix: Prefix of all bodies, joints, geoms and sites, for names that no other robot has.
-        stand: Where the MJCF stands in the base frame, whose origin is on the floor.
-        turn: How it is turned there about z, rad.
+        stand: Position of the MJCF in the base frame, whose origin is on the floor.
+        turn: Turn of it there about z, rad.
         attach: Further MJCFs.
         mimic: Joints that follow another, where the MJCF has a linkage or a tendon in place of a coupling.
         fixed: Joints that do not move, of linkages that a tree can't have.
         velocity: Limits by joint, rad/s or m/s; an MJCF has none.
         effort: Limits by joint in place of the MJCF's, N m or N.
         range: The same of positions, such as those that cables leave, rad or m; with them no joint turns without end.
-        damping: By joint in place of the MJCF's, N m s/rad or N s/m.
+        damping: Damping by joint in place of the MJCF's, N m s/rad or N s/m.
         boxes: All shapes of a link, seen and touched.
         hulls: Links that collide where they are seen: hulls of their visual meshes in place of the MJCF's shapes.
         add: Collision shapes in addition, by link, such as of one that the MJCF only shows.
         replace: A collision shape by its name; none: it is left out.
         frames: Links in addition.
         materials: rgba of those of boxes.
-        triangles: Of all visual meshes together, at most.
+        triangles: Most triangles of all visual meshes together.
         detail: Weight by visual mesh file: the greater, the more of its triangles stay.
         meshes: Robot whose mesh files are taken where name and extents are the same; "": none.
     """

@@ -42,10 +42,10 @@ class MeasuredHand:
     """A hand.
 
     Attributes:
-        parts: As `HandParts` has it.
+        parts: Measures, same as in `HandParts`.
         sign: Sign of the finger joint, as `ArmParts.finger_sign`.
         pads: Boxes to add by link: pose (4, 4) in the link, and edges (3,); none where it has a pad.
-        T_tip_tcp: Where the tool centre point should be, in the link that was given for it, (4, 4); None: it is there.
+        T_tip_tcp: (4, 4) pose of the tool centre point in the link that was given for it; None: it is there.
     """
 
     parts: dict[str, Any]
@@ -62,7 +62,7 @@ class _FingerFlat:
         side: Side of the middle on which it is, -1 or 1.
         low: Least x and z.
         high: Greatest x and z.
-        y: Of it.
+        y: Position of the flat along the closing axis, m.
         tip: Greatest z of the finger.
     """
 

@@ -61,7 +61,7 @@ class MeshFiles:
         """Take the mesh of a geom.
 
         Args:
-            geom: Of the model.
+            geom: Geom of the model.
             seen: Its triangles, or else its convex hull, which MuJoCo collides with.
             coarse: A hull of few triangles around one that is made to be seen.
         """
@@ -95,7 +95,7 @@ class MeshFiles:
 
         Args:
             folder: Folder of the robot.
-            limit: Of triangles that are seen, each as often as it is.
+            limit: Most triangles that are seen, each as often as it is.
             detail: Weight by the stem of a visual mesh, see `Edits`.
 
         Returns:

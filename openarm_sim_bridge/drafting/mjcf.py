@@ -82,8 +82,8 @@ class UrdfDraft:
     Args:
         name: Name of the robot.
         model: Its bodies have at most one joint each, a hinge or slide.
-        edits: What is not in the MJCF.
-        shared: As for `MeshFiles`.
+        edits: Facts that are not in the MJCF.
+        shared: Same as for `MeshFiles`.
 
     Raises:
         OpenArmError: CONFIG_INVALID, naming each joint that a URDF cannot have, and each name of the edits that the

@@ -70,7 +70,7 @@ def write_srdf(folder: Path, out: Path | None = None) -> tuple[Path, dict[Pair, 
     """Write the SRDF of a robot's folder.
 
     Args:
-        folder: With `robot.yaml` and `semantics.yaml`.
+        folder: Folder with `robot.yaml` and `semantics.yaml`.
         out: Another file than that of the folder.
 
     Returns:

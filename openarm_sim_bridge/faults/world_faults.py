@@ -160,7 +160,7 @@ def nudge(world: World, parameters: ObjectNudged, seed: int) -> None:
 
     Args:
         world: The world.
-        parameters: Which object, and how far.
+        parameters: Name of the object, and the distance.
         seed: Seed of the direction.
 
     Raises:

@@ -33,7 +33,7 @@ class CameraNode(Node):
     """Draws the states that it receives.
 
     Args:
-        receiver: Where states come from.
+        receiver: Receiver of states.
     """
 
     def __init__(self, receiver: StateReceiver) -> None:

@@ -58,7 +58,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
 
     Args:
         spare: A process for its cameras.
-        kwargs: Of `BaseNode`.
+        kwargs: Arguments of `BaseNode`.
 
     Raises:
         OpenArmError: CONFIG_INVALID or SCENE_INVALID, when the world can't be made.

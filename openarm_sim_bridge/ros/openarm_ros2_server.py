@@ -32,7 +32,7 @@ class PositionControllerServer:
         node: Owner.
         name: Name of the controller.
         controller: The controller.
-        simulation: Whose thread runs it.
+        simulation: Simulation whose thread runs it.
     """
 
     def __init__(self, node: BaseNode[Any], name: str, controller: PositionController, simulation: Simulation) -> None:

@@ -77,7 +77,7 @@ class SimulationServer:
         node: Owner.
         stage: Makes worlds.
         scene: The scene that is simulated.
-        simulation: Whose world it is.
+        simulation: Simulation whose world it is.
         stays: The robot stays where it is when the world is reset: its joints are those of motors that hold it.
     """
 

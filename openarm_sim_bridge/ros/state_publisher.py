@@ -30,8 +30,8 @@ class StatePublisher:
         node: Owner of the publishers.
         description: The robot.
         joint_names: Order of the joint states.
-        tf_rate: Of /tf, Hz.
-        ground_truth_rate: Of the objects, Hz.
+        tf_rate: Rate of /tf, Hz.
+        ground_truth_rate: Rate of the objects' poses, Hz.
         clock: Whether there is /clock.
         robot: Whether there are joint states and frames; those of emulated motors are of the node before them.
     """

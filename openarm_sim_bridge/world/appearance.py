@@ -34,8 +34,8 @@ class Lamps:
     """Light of a scene.
 
     Attributes:
-        ambient: Of all directions.
-        diffuse: From the camera.
+        ambient: Light of all directions.
+        diffuse: Light from the camera.
         directions: (n, 3) unit, of each lamp.
         colors: (n, 3) of each lamp.
         specular: (n,) of each lamp.
@@ -110,8 +110,8 @@ def vary(spec: mujoco.MjSpec, table: Table, seed: int) -> None:
     """Give the environment of a scene the appearance of a seed.
 
     Args:
-        spec: With floor, lamps and table, changed.
-        table: On which sheets of paper lie that are seen and touch nothing.
+        spec: Model with floor, lamps and table, changed.
+        table: Table on which sheets of paper lie that are seen and touch nothing.
         seed: Same seed, same appearance.
     """
     rng = np.random.default_rng([seed, 31])

@@ -40,9 +40,9 @@ def export(kind: Kind, scene: str | None = None, seed: int = 0, folder: Path | N
     Args:
         kind: "urdf": expanded, one file; "srdf"; "mjcf": as MuJoCo reads it, with actuators and contact settings
             (MuJoCo writes six digits).
-        scene: For MJCF: name or path of a scene to put around the robot, with the cameras; None is the robot alone.
+        scene: Name or path of a scene to put around the robot in an MJCF, with the cameras; None is the robot alone.
         seed: Seed of the scene "random".
-        folder: In which the text will be: mesh files are named from there; None: by absolute paths.
+        folder: Folder in which the text will be: mesh files are named from there; None: by absolute paths.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for an unknown kind or a scene that the kind cannot hold; SCENE_INVALID.

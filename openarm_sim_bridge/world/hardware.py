@@ -67,7 +67,7 @@ class Encoders:
     """How commands and states of joints differ from the truth; arrays (n,), in the order of the joints.
 
     Attributes:
-        zero: What is added to true positions, rad.
+        zero: Offset that is added to true positions, rad.
         position, velocity, effort: Steps of the numbers on the bus; 0: exact.
         latency_s: Until a command takes effect.
     """
@@ -142,7 +142,7 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
     """Return the robot of the seeds of a profile.
 
     Args:
-        config: What is possible.
+        config: Ranges of what is drawn.
         description: The robot.
 
     Raises:

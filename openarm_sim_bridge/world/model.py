@@ -95,10 +95,10 @@ def build_spec(
     Args:
         description: The robot, from `RobotDescription.load()`.
         scene: Table and objects.
-        cameras: By name; mounts with an error are placed by `mount_seed`.
+        cameras: Cameras by name; mounts with an error are placed by `mount_seed`.
         mount_seed: Seed of the mount errors; None is the nominal mounts.
         physics: None is the defaults.
-        robot: Of `robot_spec` with the same physics, which saves reading the URDF; not changed.
+        robot: Result of `robot_spec` with the same physics, which saves reading the URDF; not changed.
 
     Returns:
         An editable model: bodies are named like links, joints and actuators like joints, objects by their names.

@@ -122,7 +122,7 @@ def add_object(spec: mujoco.MjSpec, item: SceneObject, table: Table, contact: Ma
     Args:
         spec: Model that is extended.
         item: The object.
-        table: On which it is placed where it has no height.
+        table: Table on which it is placed where it has no height.
         contact: Geom attributes.
         condim: Contact dimensions.
     """
@@ -173,7 +173,7 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed
 
     Args:
         spec: Model that is extended.
-        cameras: With nominal mounts.
+        cameras: Cameras with nominal mounts.
         mount_seed: Seed of the mount errors; None is the nominal mounts.
 
     Raises:

@@ -25,7 +25,7 @@ class Stage:
 
     Args:
         description: The robot as the suite believes; what is simulated is as its folder describes it.
-        cameras: By name.
+        cameras: Cameras by name.
         mount_seed: Seed of the camera mounts' errors; None is the nominal mounts.
         physics: Solver, contacts, fingers.
         hardware: Motors of the arms, and how they differ from the description; None is ideal ones.

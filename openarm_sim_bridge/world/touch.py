@@ -32,7 +32,7 @@ def wrist_wrench(data: mujoco.MjData, body: str) -> tuple[Array, Array]:
 
     Args:
         data: The state after a step.
-        body: With hand sensors.
+        body: Body with hand sensors.
     """
     return data.sensor(f"{body}_force").data.copy(), data.sensor(f"{body}_torque").data.copy()
 
@@ -42,7 +42,7 @@ def imu(data: mujoco.MjData, body: str) -> tuple[Array, Array]:
 
     Args:
         data: The state after a step.
-        body: With hand sensors.
+        body: Body with hand sensors.
     """
     return data.sensor(f"{body}_gyro").data.copy(), data.sensor(f"{body}_accelerometer").data.copy()
 

@@ -87,7 +87,7 @@ class World:
             equality couples to another follow it.
         objects: Free bodies to report, by the names of their free joints.
         period_ns: Length of a control tick.
-        encoders: What commands and joint states go through; None is the truth.
+        encoders: Encoders that commands and joint states go through; None is the truth.
         sleep: Whether objects at rest are left out of the physics until something that moves touches them.
 
     Raises:

@@ -62,9 +62,9 @@ class Listener:
         node: Owns the readers; an executor that spins it leaves them alone.
         patterns: Regular expressions; a topic whose whole name matches one is taken, also when it comes later.
         put: Gets each topic before its first message, and each message.
-        image_rate: Of each image stream, at most, Hz of their stamps; 0 keeps all.
+        image_rate: Largest rate of each image stream, Hz of their stamps; 0 keeps all.
         depth: Messages that a reader keeps between two calls of `drain`.
-        on_demand: As `patterns`, of topics that are made for their subscribers: taken while another node does.
+        on_demand: Patterns of topics that are made for their subscribers: taken while another node does.
 
     Attributes:
         topics: Names of what is taken, or was.

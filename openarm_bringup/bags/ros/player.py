@@ -133,8 +133,8 @@ class Player(ContextNode):
 
         Args:
             rate: Times real time. With 0, each message waits only until reliable subscribers have taken the last.
-            start: In the bag, s.
-            duration: In the bag, s.
+            start: Start in the bag, s.
+            duration: Duration in the bag, s.
             stop: Ends it early.
         """
         first = self._bag.start_ns + round(start * 1e9)

@@ -63,7 +63,7 @@ class Recorder(ContextNode):
         path: Folder of the bag.
         patterns: Regular expressions; a topic whose whole name matches one is recorded, also when it comes later.
         custom: Kept in the metadata.
-        image_rate: Of each image stream, at most, Hz of their stamps; 0 keeps all.
+        image_rate: Largest rate of each image stream, Hz of their stamps; 0 keeps all.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for a pattern that is none or a folder that exists.

@@ -61,12 +61,12 @@ class Layer:
 
     Args:
         node: Owns the subscriptions.
-        sources: What is polled.
+        sources: Sources that are polled.
         show: Given the new messages of each of them.
         period: Between two updates, s.
 
     Attributes:
-        fault: What keeps it from being shown; empty when nothing does.
+        fault: Reason why it is not shown; empty when it is.
         due: When it is updated next, s of the monotonic clock.
     """
 

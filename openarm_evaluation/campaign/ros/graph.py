@@ -46,7 +46,7 @@ def rows_of_graph(options: CampaignOptions, seeds: Sequence[int], folder: Path, 
     """Run the tasks of seeds through a graph of its own, in real time; `keep` is called with each row.
 
     Args:
-        options: What is run.
+        options: Campaign to run.
         seeds: One task each.
         folder: Folder of the campaign; it gets logs, parameters and scenes.
         keep: Takes a row.
@@ -126,7 +126,7 @@ def bring_home(client: GraspClient) -> None:
     """Bring arms to where a scene is put before them: those of motors stay where they are when the world is reset.
 
     Raises:
-        OpenArmError: What keeps an arm from getting there.
+        OpenArmError: Reason why an arm does not get there.
     """
     from openarm_bringup.ros.stop_client import release
     from openarm_motion.ros.client import MotionClient
@@ -149,8 +149,8 @@ def keep_recording(client: GraspClient, row: Row, folder: Path, timeout: float =
     """Keep what the flight recorder has of a task that did not go as expected, also one that the grasp calls a success.
 
     Args:
-        client: Of the graph.
-        row: Of the task.
+        client: Client of the graph.
+        row: Row of the task.
         folder: Gets the recording and the row with its reason.
         timeout: Longest wait until the recording is complete, s of wall clock.
     """

@@ -35,8 +35,8 @@ def dropped(
     """Return objects as they lie after they were dropped one above the other, between walls that are then taken away.
 
     Args:
-        sources: As `openarm_common.objects.model.load_object`.
-        table: That they fall on.
+        sources: Objects, same as for `openarm_common.objects.model.load_object`.
+        table: Table that they fall on.
         centre: (x, y) above which they are dropped, m.
         half: Half of the distance of the walls, m.
         rng: Turns them.

@@ -34,9 +34,9 @@ def make_task(set_name: str, seed: int, objects: str = "") -> Task:
     """Make the task of a suite and a seed, for this process's robot.
 
     Args:
-        set_name: Of the suite.
+        set_name: Name of the suite.
         seed: Seed of the task.
-        objects: Which objects suites of any shape take, as `things.object_sources`.
+        objects: Objects that suites of any shape take, same as for `things.object_sources`.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the suites; a suite of two arms, for a robot with one.

@@ -26,8 +26,8 @@ class FaultPlan:
     """Something that goes wrong.
 
     Attributes:
-        name: Of `openarm_sim_bridge.faults.faults`.
-        parameters: Of it.
+        name: Name in `openarm_sim_bridge.faults.faults`.
+        parameters: Parameters of the fault.
         when: State that is entered when it begins; "" begins with the scene.
         until_attempt: It is cleared when this attempt begins; 0: never.
     """
@@ -43,25 +43,25 @@ class Task:
     """One row of a campaign.
 
     Attributes:
-        set_name: Of `SUITES`.
+        set_name: Name in `SUITES`.
         seed: Seed of everything that is drawn.
-        scene: What is on the table.
+        scene: Scene with the objects on the table.
         labels: Requested objects, one after the other.
         arm: auto, or an arm of the robot.
-        kind: What is special, for the report.
-        fault: What goes wrong; None: nothing.
+        kind: Kind of the scene, for the report.
+        fault: Fault to inject; None: none.
         sets: Parameters of nodes, `node.param=value`: faults that nodes inject themselves.
         codes: Allowed results; OK is placed. Without OK it is impossible and must be refused.
         mount_seed: Seed of the true camera mounts; None: nominal.
         dynamics_seed: Seed of motors, masses and joint zeros; None: that of the configuration.
         hand_seed: Seed of stops and friction of the fingers; None: that of the configuration.
         place: (x, y) of the requested footprint centre, base frame, m; None: chosen by the suite.
-        place_on: What it is to stand on or in, in words; "": the table.
+        place_on: Object that it is to stand on or in, in words; "": the table.
         posture: Joints that start elsewhere than at home, rad by name.
         clear: Repeated labels are several objects: what was placed stays where it is.
-        route: By which it must come to its place, as `GraspOutcome.route`; "": any.
+        route: Route by which it must come to its place, as in `GraspOutcome.route`; "": any.
         together: Two labels are requested at once, of both arms.
-        graspable: Of objects of any shape by name: why a hand can't take it, as the judge decides; "" where it can.
+        graspable: Reason why a hand can't take an object of any shape, by name, as the judge decides; "" where it can.
     """
 
     set_name: str

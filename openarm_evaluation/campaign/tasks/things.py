@@ -64,7 +64,7 @@ def objects_task(seed: int, objects: str = "") -> Task:
 
     Args:
         seed: Seed of side, place, turn and appearance.
-        objects: As `object_sources`.
+        objects: Objects, same as for `object_sources`.
     """
     sources, rng = object_sources(objects), np.random.default_rng([seed, 41])
     source, region = sources[seed % len(sources)], robot_work().region
