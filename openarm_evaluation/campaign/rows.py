@@ -66,7 +66,7 @@ def read_lines(path: Path, kind: type[CompareRow]) -> tuple[list[dict[str, Any]]
 
     Args:
         path: Path of the file.
-        kind: Keys that must be in each row.
+        kind: Type of a row.
 
     Returns:
         The rows, and the text of all whole lines.
