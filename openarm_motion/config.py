@@ -40,7 +40,7 @@ class LimitsConfig(Config):
         """Return the limits of an arm.
 
         Args:
-            robot: What its folder says; None: nothing.
+            robot: Limits in the robot's folder; None: none.
             arm: Its name.
             names: Its joints.
 

@@ -31,9 +31,9 @@ class Source:
         exclude: Names of samples to leave out.
         store: Folder of stored calibrations.
         camera: Camera of a bag: whose images are used; needed when it has several.
-        board: Of a bag: the board, such as charuco:7x5:34mm:26mm:DICT_6X6_250, its keys as YAML, or a YAML file; 4x11
+        board: Board of a bag, such as charuco:7x5:34mm:26mm:DICT_6X6_250, its keys as YAML, or a YAML file; 4x11
             circles when not given.
-        carrier: Of a bag: link that holds the board when the camera is fixed; that of the right hand when not given.
+        carrier: Link that holds the board of a bag when the camera is fixed; that of the right hand when not given.
         mount_seed: Seed of a bag: of simulated mounts; what it says of itself when not given.
         session: File (.npz) to write the samples of a bag to.
     """

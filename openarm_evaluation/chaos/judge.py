@@ -133,10 +133,10 @@ def claims(track: Sequence[Sample], success: bool, outcome: str, place: Sequence
     """Return what an answer says that is not so.
 
     Args:
-        track: Of the object that was asked for, from before the request until it is at rest.
-        success: What the answer claims.
+        track: Track of the object that was asked for, from before the request until it is at rest.
+        success: Claim of the answer.
         outcome: Outcome of the answer, as `GraspResult.outcome`; "" when no answer came.
-        place: Where the answer says it was placed.
+        place: Place in the answer.
     """
     found: list[Violation] = []
     if len(track) < 2 or since_reset(track) != list(track):

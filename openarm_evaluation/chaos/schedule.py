@@ -43,11 +43,11 @@ class Fault:
     """Something that goes wrong once.
 
     Attributes:
-        kind: Of `KINDS`.
+        kind: One of `KINDS`.
         when: State of the grasp in which it begins; "": before the request.
-        after: From the beginning of that state, s.
-        seconds: How long it lasts; 0 for a kill.
-        node: That is killed or stopped, or whose parameters change.
+        after: Time from the beginning of that state, s.
+        seconds: Duration; 0 for a kill.
+        node: Node that is killed or stopped, or whose parameters change.
         injected: Name and parameters of the simulation's fault.
         share: Parameter of the node that is the share of what fails, and its value.
     """
@@ -76,7 +76,7 @@ class Round:
     """One request and what goes wrong meanwhile.
 
     Attributes:
-        number: From 0.
+        number: Number of the request, from 0.
         pick: Number that chooses one of the objects on the table.
         arm: auto, or an arm of the robot.
         worded: Ask by color and shape, not by the label.
@@ -109,9 +109,9 @@ def rounds(seed: int, kinds: Sequence[str], nodes: Sequence[str], arms: Sequence
 
     Args:
         seed: Seed of all draws.
-        kinds: Of faults; none: only requests.
-        nodes: That may be killed and stopped.
-        arms: Of the robot; every other request or so is for a particular one.
+        kinds: Kinds of faults; none: only requests.
+        nodes: Nodes that may be killed and stopped.
+        arms: Arms of the robot; every other request or so is for a particular one.
     """
     rng = np.random.default_rng([seed, 18])
     bags = {name: _in_turn(rng, choices) for name, choices in (("", kinds), ("kill", nodes), ("stop", nodes))}

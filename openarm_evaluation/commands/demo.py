@@ -25,7 +25,7 @@ def demo(*, options: DemoOptions = DEFAULTS, accept: float = 0.9) -> Outcome:
     Leaves a folder below runs/ with report.json, the logs of all nodes, pictures and a video.
 
     Args:
-        accept: With seeds: the share of objects placed that counts as success.
+        accept: Share of objects placed that counts as success, with seeds.
     """
     choose_robot(options.robot)
     check_arms(options.arm)

@@ -58,7 +58,7 @@ def run_demo(options: DemoOptions, listeners: Listeners | None = None) -> DemoRe
     """Run the demonstration to its end; the graph is stopped whatever happens.
 
     Raises:
-        OpenArmError: What is wrong with the options; what happens later is in the result.
+        OpenArmError: Fault of the options; what happens later is in the result.
     """
     domain = reserve_domain() if options.domain is None else options.domain
     overrides = {

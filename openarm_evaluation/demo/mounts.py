@@ -36,7 +36,7 @@ def calibrate_once(mount_seed: int, on_note: Callable[[str], None]) -> None:
     The zeros of the joints are determined and stored with the first ones.
 
     Raises:
-        OpenArmError: What kept it from working, or DEGENERATE, when a result was not good enough to be stored.
+        OpenArmError: Reason why it did not work; DEGENERATE, when a result was not good enough to be stored.
     """
     cameras = uncalibrated(mount_seed)
     if not cameras:

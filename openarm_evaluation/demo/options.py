@@ -19,9 +19,9 @@ class DemoOptions:
 
     Args:
         seeds: Random scenes one after the other, such as 0-19; in each the first object is grasped.
-        label: What to grasp; the first object of the scene when not given.
-        arm: Which arm.
-        place: Where to place it: x y z of the footprint centre, base frame, m (z is not read); seeds when not given.
+        label: Object to grasp, in words; the first object of the scene when not given.
+        arm: Arm to use.
+        place: Place for it: x y z of the footprint centre, base frame, m (z is not read); seeds when not given.
         scene: Name or path of a scene, or "random".
         graph: Name of a graph, or a file.
         video: Pictures and a video; by default for a single grasp only.

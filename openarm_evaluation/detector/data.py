@@ -48,7 +48,7 @@ def make_data(folder: Path, config: DataConfig, progress: Callable[[str, int], N
 
     Args:
         folder: Folder of the data set.
-        config: How many, and the seed.
+        config: Number of pictures, and the seed.
         progress: Called after each picture with its set and number.
 
     Returns:

@@ -34,7 +34,7 @@ def read_labels(text: str, width: int, height: int, classes: int, where: str) ->
         text: Lines of `class cx cy width height`.
         width: Width of the picture, pixels.
         height: Height of the picture, pixels.
-        classes: How many there are.
+        classes: Number of classes.
         where: Prefix of every fault, such as the path of the file.
 
     Raises:

@@ -58,9 +58,9 @@ class Graspable:
     Attributes:
         yes: Whether.
         reason: Why not; "" where it can be.
-        arm: That reaches it.
+        arm: Arm that reaches it.
         width: Between the pads, m.
-        tilt: From straight down, rad.
+        tilt: Angle from straight down, rad.
         T_base_tcp: (4, 4) of the hand; None where it can't be.
     """
 

@@ -61,7 +61,7 @@ class Verdict:
 
     Args:
         placed: Lifted, then upright and at rest within tolerance of the target.
-        reasons: What is wrong, one sentence each; empty when placed.
+        reasons: Faults, one sentence each; empty when placed.
         place_error: m, horizontal, footprint centre to target.
         rise: m, greatest rise of the centre.
         tilt: rad, change of the upward axis.
@@ -94,7 +94,7 @@ def judge(
 
     Args:
         track: Samples in the order of time, the first from before anything moved.
-        target_xy: Where the footprint centre should be, m, world; NaN when no place was chosen.
+        target_xy: Target of the footprint centre, m, world; NaN when no place was chosen.
         claimed: Whether the run reported success.
         rules: Tolerances.
         corners: (n, 3) of an object of any shape, in its frame, m; None: a plain shape.

@@ -46,13 +46,13 @@ class Trial:
     """A grasp that was observed, and its verdict.
 
     Args:
-        scene: What was on the table.
+        scene: Scene with the objects on the table.
         seed: Seed of the scene.
         target: Name of the object; "" when the scene has none of the label.
         answer: `GraspResult` of a client, or `GraspOutcome` in process.
-        verdict: Of ground truth; None when the object could not be observed.
+        verdict: Verdict of ground truth; None when the object could not be observed.
         steps: States that the grasp entered, in order.
-        wall_s: How long it took, s of wall clock.
+        wall_s: Duration, s of wall clock.
         end_ns: When the last state ended; None when it still lasts.
     """
 
@@ -194,8 +194,8 @@ def run_trial(
     Args:
         observer: Observes the graph.
         client: Requests the grasp.
-        scene: What is on the table now.
-        wanted: What to grasp and where to place it; without a label, the first object of the scene.
+        scene: Scene with the objects that are on the table now.
+        wanted: Object to grasp and place to put it; without a label, the first object of the scene.
         seed: Seed of the scene, for the report.
         after_ns: Ground truth up to this time is of an earlier scene.
         before: Called when the scene is at rest, before the grasp is requested.

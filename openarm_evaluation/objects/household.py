@@ -35,7 +35,7 @@ class Household:
 
     Attributes:
         mass: kg.
-        pieces: What it is made of.
+        pieces: Pieces that it is made of.
         friction: Sliding, against table and objects.
     """
 

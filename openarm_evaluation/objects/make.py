@@ -30,8 +30,8 @@ def make_objects(
     """Write object folders.
 
     Args:
-        folder: That they are written into.
-        names: Of `HOUSEHOLD`; all without.
+        folder: Folder to write them into.
+        names: Names in `HOUSEHOLD`; all without.
         advance: Called with each name that is done.
 
     Raises:

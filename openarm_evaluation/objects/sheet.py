@@ -31,13 +31,13 @@ def write_sheet(
 
     Args:
         path: Path of the PNG.
-        sources: As `openarm_common.objects.model.load_object`.
-        side: That each rests on; its last one where it has fewer.
+        sources: Same as for `openarm_common.objects.model.load_object`.
+        side: Side that each rests on; its last one where it has fewer.
         parts: Draw the convex parts instead of what is seen.
         seed: Seed of lamps, table and paper; None: plain.
 
     Raises:
-        OpenArmError: As `load_object`; ENVIRONMENT without OpenGL.
+        OpenArmError: Same as `load_object`; ENVIRONMENT without OpenGL.
     """
     columns = math.ceil(math.sqrt(1.4 * len(sources)))
     rows = math.ceil(len(sources) / columns)

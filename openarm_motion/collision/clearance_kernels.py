@@ -341,10 +341,10 @@ def check_listed(start: int, count: int, end: int, sways: Array, model: Model, w
     """Check listed groups (and bodies in the map) in the state that bodies were placed for.
 
     Args:
-        start: Where the list begins.
-        count: How many are in it.
-        end: Where those are listed that may come too near in the interval; nothing is for -1.
-        sways: Of the interval, or those of a state alone.
+        start: Index at which the list begins.
+        count: Number of pairs in it.
+        end: Index at which those are listed that may come too near in the interval; nothing is for -1.
+        sways: Sways of the interval, or those of a state alone.
         model: The scene.
         work: Room.
 

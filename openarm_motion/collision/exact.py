@@ -58,7 +58,7 @@ class CollisionContext:
         supports: Ids of boxes that a held box may rest on.
         fixed: Ids of boxes that are where they are said to be; the others are estimates.
         clearance: Distances to keep.
-        map: What the cameras observe in addition; None is nothing.
+        map: Map of the cameras; None is nothing.
         own: Whether the arm is checked against itself and the robot's body; False leaves the other arm and the boxes.
         allowed: Pairs of links and bodies that may touch, by name (see `body_of`).
     """
@@ -84,7 +84,7 @@ class Contact:
         first: Link or held box.
         second: Link or obstacle.
         distance: < 0 is how deep they overlap, m.
-        required: What it should be, m.
+        required: Clearance that is required, m.
         where: Added to the name of the second in a sentence.
     """
 
@@ -132,7 +132,7 @@ class CollisionScene(LineChecks):
 
     Args:
         robot: The robot seen by the arm.
-        around: What is around it.
+        around: Obstacles around it.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when two boxes have one id.

@@ -44,7 +44,7 @@ class FastScene:
 
     Args:
         scenes: Exact scenes of the arms, one each, of the same robot; configurations are in their order.
-        field: What else is in the way.
+        field: Distance field of the other obstacles.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the reach of the map is too short to say anything.

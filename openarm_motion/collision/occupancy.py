@@ -38,7 +38,7 @@ class DistanceMap:
         distances: float32, m.
         corner: (3,) lower corner of the first cell, base frame, m.
         resolution: Edge of a cell, m.
-        reach: Where distances are cut, m.
+        reach: Largest distance; others are cut to it, m.
     """
 
     distances: Floats
@@ -53,7 +53,7 @@ class OccupancyMap:
 
     Attributes:
         indices: (n, 3) of the cells on the lattice.
-        lattice: Which cells there are.
+        lattice: Cells of the map.
         version: Version of the map.
     """
 
@@ -135,7 +135,7 @@ class Environment:
 
     Attributes:
         solids: Bodies of the planning scene.
-        map: What the cameras observed.
+        map: Map of the cameras.
         arm_clearance: The arms keep at least this distance from each other, m.
         allowed: Pairs of links and bodies that may touch, by name.
     """

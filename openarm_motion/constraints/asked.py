@@ -15,7 +15,7 @@ class RegionGoal:
 
     Attributes:
         regions: Any of them will do.
-        path: What every configuration on the way satisfies.
+        path: Constraints on every configuration of the path.
         time_limit: Time limit of the search, s; 0: the default.
     """
 
@@ -33,8 +33,8 @@ class CartesianGoal:
         max_step: Way of the tool between two points of the trajectory, m; 0: as the sampling period has it.
         revolute_jump: A joint that changes by more than this between two points ends the path, rad; 0: 0.2 rad.
         jump_factor: A change of the joints that is so many times the average one ends the path; 0: none does.
-        avoid_collisions: What collides ends the path.
-        path: What leaves this ends the path.
+        avoid_collisions: True to end the path where something collides.
+        path: Constraints whose violation ends the path.
     """
 
     waypoints: tuple[Array, ...]

@@ -29,7 +29,7 @@ def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0, end: f
 
     Args:
         arm: The arm.
-        region: Where.
+        region: Region of the goal.
         start: (n,) joints that are not constrained stay as here.
         scale: Scale of velocity, see `StartState`.
         end: After it, s of the monotonic clock, nothing else is drawn.

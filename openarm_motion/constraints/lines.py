@@ -28,8 +28,8 @@ class ConstrainedLines(LineChecks):
 
     Args:
         arm: The arm.
-        scene: What it keeps clear of.
-        region: Where it stays.
+        scene: Planning scene to keep clear of.
+        region: Region to stay in.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for a joint of another arm.

@@ -17,7 +17,7 @@ class RobotNames:
 
     Args:
         description: The robot.
-        arms: By name.
+        arms: Arms by name.
     """
 
     def __init__(self, description: RobotDescription, arms: Mapping[str, Arm]) -> None:

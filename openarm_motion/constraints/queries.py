@@ -27,7 +27,7 @@ class Verdict:
 
     Attributes:
         contacts: Pairs that are nearer than plans keep, the deepest first.
-        constraints: What is constrained, and how far it is beyond the tolerance, m or rad, times its weight.
+        constraints: Constraints, and how far each is beyond its tolerance, m or rad, times its weight.
         limits: The joint that is beyond its limits, in words; "" where none is.
     """
 
@@ -55,7 +55,7 @@ def solve(
 
     Args:
         arm: The arm.
-        now: Where it is.
+        now: Present configuration.
         around: Boxes of the request.
         region: The goal.
         avoid_collisions: Whether they count.

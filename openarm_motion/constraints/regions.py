@@ -29,7 +29,7 @@ class JointInterval:
     """Position of a joint, and how far it may be above and below, rad or m.
 
     Attributes:
-        weight: As in `Region.weights`.
+        weight: Same as in `Region.weights`.
         upper: Upper limit of the joint; infinite where whole turns make no difference.
     """
 
@@ -109,7 +109,7 @@ class OrientationRegion:
     """A link fixed to the tool is turned as `R` (3, 3), but for a tolerance about each axis of that, rad.
 
     Attributes:
-        link: For messages.
+        link: Name of the link, for messages.
         R_tool_link: (3, 3).
         R: (3, 3) of the link.
         tolerance: (3,) about x, y, z.

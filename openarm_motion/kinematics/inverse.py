@@ -41,7 +41,7 @@ class InverseKinematics:
 
     Args:
         kinematics: The arm.
-        swivels: How many swivel angles of a whole turn are tried.
+        swivels: Number of swivel angles of a whole turn that are tried.
     """
 
     def __init__(self, kinematics: ArmKinematics, swivels: int = 48) -> None:
@@ -120,7 +120,7 @@ class InverseKinematics:
             start: Configuration to start from.
             margin: Kept from the joint limits, rad.
             max_step: Greatest change of a joint between neighbouring poses, rad.
-            swivel_change: How far the elbow swivels along the path, rad; has no meaning for a numeric arm.
+            swivel_change: Angle that the elbow swivels by along the path, rad; has no meaning for a numeric arm.
 
         Returns:
             The path (m, n), the index of the first pose that fails (m when none does), and why it fails.

@@ -81,7 +81,7 @@ def solve_line(
         T_end: (4, 4).
         margin: Kept from the joint limits, rad.
         max_step: Greatest change of a joint between two points, rad.
-        swivel_change: How far the elbow swivels along the line, rad.
+        swivel_change: Angle that the elbow swivels by along the line, rad.
 
     Raises:
         OpenArmError: UNREACHABLE, with the distance from the start at which the line ends and why.

@@ -33,7 +33,7 @@ class SrsMiss:
     """Why a pose has no configuration within the limits.
 
     Attributes:
-        too_far: How much further than the arm reaches the wrist would be, m; negative: how much too near; else 0.
+        too_far: Distance of the wrist beyond the reach of the arm, m; negative: too near by so much; else 0.
         nearest: (k, 7) of each branch the configuration that exceeds its limits the least, the best first; at the
             nearest pose within reach where the distance is the reason, and empty when that is far away.
     """

@@ -216,7 +216,7 @@ def plan_together(both: DualArm, now: StartState, wanted: DualArmGoals, time_lim
     Args:
         both: The arms.
         now: The robot's joints; `start` is that of both arms (n1 + n2,).
-        wanted: Where to.
+        wanted: Goal of both arms.
         time_limit: s.
 
     Raises:

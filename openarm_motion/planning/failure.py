@@ -37,9 +37,9 @@ class PlanFailedError(OpenArmError):
     """An error that knows where it happened.
 
     Args:
-        code: As `OpenArmError`.
-        message: As `OpenArmError`.
-        stage: How far planning got.
+        code: Same as for `OpenArmError`.
+        message: Same as for `OpenArmError`.
+        stage: Stage that planning got to.
         contact: The pair in the way, where there is one.
         alternative: The nearest goal that works, where one was searched and found.
         at: Moment of a trajectory, s; NaN where it is about none.

@@ -89,7 +89,7 @@ class LiftedArms(Mapping[str, Arm]):
         """Be the arms of another description of the same robot, at the height that they are at.
 
         Raises:
-            ValueError: For arms that are on no lift.
+            ValueError: Arms that are on no lift.
         """
         if not isinstance(arms, LiftedArms):
             raise ValueError("expected arms on a lift")
@@ -118,7 +118,7 @@ class LiftMotion:
     Args:
         description: The robot.
         lift: Its lift.
-        arms: At any height, by name.
+        arms: Arms at any height, by name.
     """
 
     def __init__(self, description: RobotDescription, lift: LiftParts, arms: Mapping[str, Arm]) -> None:
@@ -137,9 +137,9 @@ class LiftMotion:
         """Plan a motion to a height.
 
         Args:
-            arms: As they are, by name.
+            arms: Arms by name, where they are.
             now: State of all joints, and the surroundings.
-            held: What each hand holds, tool frame.
+            held: Boxes that each hand holds, tool frame.
             height: Position of the lift, m.
             obstacles: Boxes in addition, base frame.
 

@@ -91,7 +91,7 @@ def grow(
         levers: (n,) m.
         model: The scene.
         work: Room.
-        iterations: How many samples.
+        iterations: Number of samples.
         seed: Seed of the samples.
 
     Returns:

@@ -71,8 +71,8 @@ def grasp_region(arms: Mapping[str, Arm], table: Table, state: Mapping[str, floa
     """Return the largest rectangle in which each arm grasps, on its side, a cube of any yaw, tilted by 30° at most.
 
     Args:
-        arms: With the table; an arm that is alone grasps on both sides.
-        table: That objects stand on.
+        arms: Arms, with the table; an arm that is alone grasps on both sides.
+        table: Table that objects stand on.
         state: State of the joints; arms that don't move stay there.
 
     Raises:
@@ -109,7 +109,7 @@ def postures(
     """Return postures by name and arm: `home`, which hides nothing of the region, and `over_table`.
 
     Args:
-        arms: With the table.
+        arms: Arms, with the table.
         table: Under the hands.
         region: Region of objects.
         eye: (3,) of the camera that sees them.

@@ -35,7 +35,7 @@ class MotionResult(Answer):
     Attributes:
         trajectories: The plan, of each arm that was asked for; empty without one.
         scene_version: Version of the planning scene that it was made in; 0 for `execute`.
-        failure: Where and why there is no plan, and the nearest feasible goal, if any; None after a success.
+        failure: Reason and place of the failure, and the nearest feasible goal, if any; None after a success.
     """
 
     trajectories: tuple[Trajectory, ...] = ()
@@ -61,7 +61,7 @@ class MotionClient(BackgroundNode):
         """Free path to joint positions (n,), rad.
 
         Args:
-            arm: For example "left".
+            arm: Arm, for example "left".
             q: The goal.
             options: `obstacles` and `attached` (boxes; without `attached` what the hand is known to hold, `hand_empty`
                 drops it), `scale` of the velocity, `plan_only`, `max_start_delay` s for another arm under way,

@@ -55,7 +55,7 @@ class ServoNode(BaseNode[NoParameters]):
     """Servoing over ROS.
 
     Args:
-        service: Of the motion node.
+        service: Service of the motion node.
         config: Parameters.
         controller: Name of the trajectory action of an arm, next to which its topic joint_trajectory is.
         check_hold: Refuses, by arm and goal, what would move an arm that another client holds.
@@ -183,7 +183,7 @@ class _End:
     Args:
         node: Owner.
         prefix: Prefix of their names.
-        arms: That are commanded by them.
+        arms: Arms that are commanded by them.
     """
 
     def __init__(self, node: ServoNode, prefix: str, arms: tuple[str, ...]) -> None:

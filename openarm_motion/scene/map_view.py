@@ -45,8 +45,8 @@ class MapView:
     """Reads the map.
 
     Args:
-        config: Whether it is needed, and how old it may be.
-        source: Of its distance fields.
+        config: Settings: whether it is needed, and how old it may be.
+        source: Source of its distance fields.
         frames: Names of the base frame; the map must be in it.
     """
 

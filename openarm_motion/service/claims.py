@@ -24,7 +24,7 @@ class ArmClaims:
 
         Args:
             names: All of them, or none where one is taken.
-            why: What others read, after "the left arm".
+            why: Sentence that others read, after "the left arm".
 
         Raises:
             OpenArmError: BUSY, when one of them is taken.

@@ -49,8 +49,8 @@ class Around:
     """What is around all arms.
 
     Attributes:
-        prepared: As for a plan of all of them.
-        held: What each holds, tool frame.
+        prepared: Contexts prepared for a plan of all of them.
+        held: Boxes that each holds, tool frame.
         seen: Equal as long as it is the same.
     """
 
@@ -64,10 +64,10 @@ class PlanningContext:
 
     Args:
         robot: The robot.
-        arms: By name.
+        arms: Arms by name.
         scene: Bodies to keep clear of.
-        held: What the hands hold.
-        coordination: Which arms are under way.
+        held: Boxes that the hands hold.
+        coordination: Coordination of the arms under way.
         map_view: The map.
         config: Parameters.
     """
@@ -109,7 +109,7 @@ class PlanningContext:
             scale: Velocity scale.
             stopped: Whether the request was cancelled.
             estimates: Boxes of the request: what the map shows of them is theirs.
-            attached: What each arm holds, tool frame.
+            attached: Boxes that each arm holds, tool frame.
             expected: Version that the scene must have; 0 is any.
 
         Raises:

@@ -13,7 +13,7 @@ class PlanFaults:
     """Counts plans and says which fail; the same seed, the same ones.
 
     Args:
-        config: Which share of the plans fails.
+        config: Share of the plans that fails.
     """
 
     def __init__(self, config: FaultsConfig) -> None:

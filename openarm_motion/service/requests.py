@@ -77,7 +77,7 @@ class PlanApproachRequest:
         start: (n,) joints that it starts from, or (1 + n,), of a lift and the arm; empty: the present ones.
         scale: Velocity scale; 0: the default.
         ignore_regions: Boxes, base frame; what the map still shows there is left out.
-        scene_version: That the planning scene must have; 0: any.
+        scene_version: Version that the planning scene must have; 0: any.
     """
 
     arm: str
@@ -94,14 +94,14 @@ class MoveRequest:
 
     Attributes:
         arm: Name of the arm; `lift`: the lift, with a `JointGoal` of its position, m.
-        goal: Where to.
+        goal: Goal of the motion.
         obstacles: Boxes, base frame.
         attached: Boxes held by the arm, tool frame; empty: what it is known to hold.
         hand_empty: It holds nothing: what it was known to hold is forgotten.
         scale: Scale of velocity, or of velocity and acceleration; 0: the default.
         plan_only: Do not move.
         max_start_delay: Longest wait for clearance next to an arm under way, s.
-        scene_version: That the planning scene must have; 0: any.
+        scene_version: Version that the planning scene must have; 0: any.
         state: Positions of joints, by name, that are taken in place of the present ones.
         attempts: Paths that are searched for, of which the one that is followed soonest is taken.
     """
@@ -180,10 +180,10 @@ class MotionAnswer:
 
     Attributes:
         error: Why it failed.
-        message: In a sentence.
+        message: A sentence.
         scene_version: Version of the planning scene that it was planned in.
         planning_time: s.
-        start_delay: How long the arm rested first for another arm under way, s.
+        start_delay: Time that the arm rested first for another arm under way, s.
     """
 
     error: OpenArmError | None = None

@@ -138,7 +138,7 @@ class ArmServo:
             now_ns: Robot time.
             wall: Time of commands, s.
             measured: Stamp and positions (n,) of the newest joint state.
-            around: What to keep clear of.
+            around: Obstacles to keep clear of.
             others: Positions (m, k) of the other arms, by name.
 
         Returns:

@@ -64,9 +64,9 @@ class Course:
 
     Attributes:
         start: State at its beginning.
-        change: From `towards`.
+        change: Change from `towards`.
         hold: s.
-        brake: From `towards`, at the end of `hold`.
+        brake: Deceleration from `towards`, at the end of `hold`.
     """
 
     start: JointState
@@ -79,10 +79,10 @@ class Course:
         """Go on with a velocity (n,), and stop.
 
         Args:
-            start: Where.
+            start: State at the beginning.
             velocity: rad/s.
             hold: s before the stop.
-            limits: That it keeps.
+            limits: Limits that it keeps.
         """
         change = towards(start, velocity, limits)
         return cls(start, change, hold, towards(_at(change, hold), np.zeros_like(velocity), limits))

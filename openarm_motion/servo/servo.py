@@ -33,7 +33,7 @@ class Servo:
     """Servoing. `start`, `stop` and `refresh` come from the event loop, all else from one thread that keeps the pace.
 
     Args:
-        service: Whose arms, planning scene and map these are.
+        service: Service whose arms, planning scene and map these are.
         config: Parameters.
         send: Hands a trajectory of an arm, and the stamp of its beginning, to its controller.
     """

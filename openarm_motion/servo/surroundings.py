@@ -56,7 +56,7 @@ class Surroundings:
         Args:
             arms: One arm, or two.
             now: Joints, planning scene and map.
-            held: What each arm holds, tool frame.
+            held: Boxes that each arm holds, tool frame.
             clearance: Distances to keep.
             lag: Joints may be this far from their set points, rad; what that moves is kept in addition.
         """

@@ -35,8 +35,8 @@ def validate_trajectory(scene: LineChecks, trajectory: Trajectory, travel: float
     """Check a trajectory densely.
 
     Args:
-        scene: What it was planned in; its clearances are reduced meanwhile, not for good.
-        trajectory: As it goes to the controller.
+        scene: Planning scene that it was planned in; its clearances are reduced meanwhile, not for good.
+        trajectory: Trajectory that goes to the controller.
         travel: Greatest travel of a point between two checks, m.
 
     Raises:

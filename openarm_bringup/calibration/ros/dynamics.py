@@ -97,7 +97,7 @@ class DynamicsClient(MotionClient):
             on_posture: Called before each with its number, from 1, and how many there are.
 
         Raises:
-            OpenArmError: As the motion node says; EXECUTION_FAILED, when the controller gives up; NO_PLAN, when no
+            OpenArmError: Error of the motion node; EXECUTION_FAILED, when the controller gives up; NO_PLAN, when no
                 posture is free; INVALID_ARGUMENT, when motions show too little.
         """
         description, arm = self._description, self._arms[side]

@@ -80,7 +80,7 @@ class Actors(BackgroundNode):
         """Do it, wait as long as it lasts, and undo it; return what was not answered as it should be.
 
         Args:
-            fault: To carry out.
+            fault: Fault to carry out.
             holding: Whether a request is in a state in which it holds an arm.
 
         Raises:

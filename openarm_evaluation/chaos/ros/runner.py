@@ -111,7 +111,7 @@ def run(
     Args:
         seed: Seed of scenes, requests and faults.
         seconds: s of wall clock; a round that has begun is finished.
-        kinds: Of faults.
+        kinds: Kinds of faults.
         folder: Gets logs, scenes and memory; `run` below it is the run folder.
         show: Called with the row of each round.
         most: Rounds at most.

@@ -55,7 +55,7 @@ class Fit:
     Args:
         data: Folder of the data set.
         folder: Folder of the run; one that holds a run of the same settings goes on.
-        config: How to train.
+        config: Settings of the training.
         first: Weights to begin with, such as the suite's; their classes must be those of the data.
 
     Raises:

@@ -46,7 +46,7 @@ class Network(nn.Module):
     """Boxes and classes of every cell.
 
     Args:
-        classes: How many.
+        classes: Number of classes.
     """
 
     def __init__(self, classes: int) -> None:

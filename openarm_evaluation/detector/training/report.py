@@ -66,7 +66,7 @@ def write_page(
     Args:
         path: Path of the HTML file.
         samples: The set.
-        results: By name of the model; failures are shown of the last one.
+        results: Results by name of the model; failures are shown of the last one.
         curve: Rows of a training run; empty without one.
         facts: Lines for the head of the page.
     """

@@ -30,7 +30,7 @@ class Scores:
     Attributes:
         map50: Mean over the classes that are there of the average precision at an overlap of one half.
         map: The same, mean over overlaps from 0.5 to 0.95.
-        ap50: By class.
+        ap50: Average precision at an overlap of 0.5, by class.
         any50: Average precision when the class does not matter.
         centre_median_px: Distance of the middles of boxes that are shown and right; NaN without one.
         centre_p95_px: The same, 95th percentile.
@@ -38,8 +38,8 @@ class Scores:
         recall: Share of objects that are shown.
         confusion: (classes + 1, classes + 1): row what it is, column what it was called; the last row is nothing
             that was called something, the last column something that was missed.
-        objects: How many there are.
-        pictures: How many there are.
+        objects: Number of objects.
+        pictures: Number of pictures.
     """
 
     map50: float

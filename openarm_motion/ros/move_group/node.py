@@ -78,7 +78,7 @@ class MoveGroupNode(BaseNode[NoParameters]):
     """Answers MoveIt's clients.
 
     Args:
-        service: Of the motion node.
+        service: Service of the motion node.
         config: Parameters.
         controller: Name of the trajectory action of an arm.
         check_hold: Refuses a goal, by arm and id, that would move an arm that another client holds.
