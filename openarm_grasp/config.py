@@ -114,15 +114,12 @@ class HeldConfig(Config):
     slip: float = Field(
         default=0.003, gt=0.0, le=0.02, description="change of the gap on the way that counts as slipping, m"
     )
-    slip_along: float = Field(
-        default=0.01, gt=0.0, le=0.05, description="an object seen so far below the hold at the lift has slipped, m"
-    )
-    rise: float = Field(default=0.03, gt=0.0, le=0.2, description="an object seen this much higher has risen, m")
+    rise: float = Field(default=0.03, gt=0.0, le=0.2, description="what is seen this much higher hangs in the hand, m")
     askew: float = Field(
-        default=0.015, gt=0.0, le=0.1, description="a lifted object that sticks out farther is held elsewhere, m"
+        default=0.015, gt=0.0, le=0.1, description="a lifted object that sticks out farther has turned or slipped, m"
     )
     moved: float = Field(
-        default=0.012, gt=0.0, le=0.1, description="an object seen this far out of its place has moved, m"
+        default=0.012, gt=0.0, le=0.1, description="a plan for an object seen this far out of its place is void, m"
     )
 
 
@@ -203,7 +200,10 @@ class PlaceConfig(Config):
 
     release_height: float = Field(default=0.001, ge=0.0, le=0.01, description="above touching the table at release, m")
     tolerance: float = Field(
-        default=0.02, gt=0.0, le=0.1, description="this near to the target counts as placed, m; any shape: 3/4 of it"
+        default=0.02,
+        gt=0.0,
+        le=0.1,
+        description="this near to the target counts as placed, m; the camera must see 3/4 of it",
     )
     yaw_step_deg: float = Field(default=30.0, gt=0.0, le=180.0, description="turns of the object that are tried, deg")
     region_x: Interval = Field(

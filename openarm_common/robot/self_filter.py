@@ -14,13 +14,14 @@ from typing import Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.config import Config, metres_by_name
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot import filter_kernels as kernels
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
-from openarm_common.types import Array, Bytes, Floats, Ints
+from openarm_common.types import Array, Bytes, Floats, Ints, Mask
 
 
 class SelfFilterConfig(Config):
@@ -145,6 +146,11 @@ class SelfFilter:
             shapes.owners, label, counts,
         )  # fmt: skip
         return label, _named(shapes, counts)
+
+    def outline(self, lens: Intrinsics, T_base_camera: Array, shapes: Shapes) -> Mask:
+        """Return the pixels (h, w) of a camera whose rays meet the robot, whatever is measured there."""
+        nothing = np.zeros((lens.height, lens.width), np.float32)
+        return self.label_depth(DepthView(nothing, lens, T_base_camera, 1.0, 1.0), shapes)[0] > 0
 
     def label_points(self, points: Floats, shapes: Shapes) -> tuple[Bytes, dict[str, int]]:
         """Find the robot in points (n, 3) of the base frame: labels (n,), and the points that each link took."""

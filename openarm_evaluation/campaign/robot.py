@@ -30,6 +30,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import per_robot
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.robot.self_filter import SelfFilter, SelfFilterConfig
 from openarm_common.robot.servos import ServoModel
 from openarm_common.robot.work import Table
 from openarm_common.robot.zeros import HandReach
@@ -42,6 +43,7 @@ from openarm_evaluation.campaign.map_feed import SimulatedMap
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.stereo import stereo_depth
 from openarm_evaluation.judging.judge import Sample
+from openarm_grasp.perception.boxes import with_points
 from openarm_grasp.perception.detections import Frame
 from openarm_motion.config import FaultsConfig, MotionConfig
 from openarm_motion.planning.arm import Arm
@@ -199,6 +201,7 @@ class SimRobot:
         self._published_ns = 0
         #: How long plans took, s of wall clock.
         self.planning_s: list[float] = []
+        self._silhouette = SelfFilter(self.description, SelfFilterConfig())
         self.map = SimulatedMap(self.description, suite.octomap, self.mounted)
         self._controllers = {arm: _ArmController(self, arm) for arm in self.simulated.controller.arms}
         arms = arms_behind(self._sets, self.table, tuple(self.mounted.values()), tuple(known.hands.items()))
@@ -328,7 +331,7 @@ class SimRobot:
         try:
             T_base_camera = self.camera_pose(camera, stamp_ns)
             optics, robot = self._drawing.intrinsics(name), None
-            if self.suite.detectors[name].depth_topic:
+            if deep := bool(self.suite.detectors[name].depth_topic):
                 view = DepthView(depth, optics, T_base_camera, camera.near, camera.far)
                 robot = self._robot_in(name, view, stamp_ns)
             else:
@@ -345,7 +348,11 @@ class SimRobot:
             self._objects[name], perceived, seen, limits, stamp_ns, self._carriers(stamp_ns)
         )
         self._objects[name] = objects
-        return Frame(stamp_ns, perceived.boxes, cloud.moved(T_base_camera))
+        if deep:
+            return Frame(stamp_ns, perceived.boxes, cloud.moved(T_base_camera))
+        frame, joints = Frame(stamp_ns, perceived.boxes), self.states.joints_at(min(stamp_ns, self.states.latest()[0]))
+        outline = self._silhouette.outline(optics, T_base_camera, self._silhouette.shapes(joints, self.held))
+        return with_points(frame, optics, T_base_camera, self.table.top_z, outline)
 
     def _carriers(self, stamp_ns: int) -> Mapping[str, Carrier] | None:
         """What the hands hold at the stamp of an image; None when their posture is not known."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From labelled clouds to what verdicts on things of any shape read. Base frame, m."""
+"""From labelled clouds to what verdicts on objects read. Base frame, m."""
 
 from __future__ import annotations
 
@@ -81,7 +81,8 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
     """Return the thing as what has risen as one body: with what came along, and without what has stayed.
 
     An image does not distinguish things that touch from parts of one thing; a motion does (Katz and Brock,
-    "Manipulating articulated objects with interactive perception", ICRA 2008). What the hand hides says nothing.
+    "Manipulating articulated objects with interactive perception", ICRA 2008). What the hand hides says nothing. What
+    was measured as a prism is one body.
 
     Args:
         frames: Since the lift, in the base frame.
@@ -91,7 +92,7 @@ def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_befo
         grip: (3,) middle between the pads when it did.
     """
     cloud = next((frame.cloud for frame in reversed(frames) if frame.cloud is not None), None)
-    if cloud is None or not len(cloud.points):
+    if cloud is None or not len(cloud.points) or sighting.target.kind:
         return sighting
     standing = cloud.points[cloud.labels > 0]
     standing = standing[_away(standing, risen) > _PART]

@@ -152,19 +152,6 @@ def stacked(a: Detection, b: Detection) -> bool:
     return upper.bottom - lower.bottom > _STACKED and not distances_from(lower, upper.p_base[None, :2]).any()
 
 
-def sticks_out(seen: Detection, stood: Detection) -> float:
-    """How far what is seen reaches out of the footprint of an object as it stood, m; 0 when it lies within.
-
-    The middles of its edges are compared: the corners of a box around something round are no part of it.
-    """
-    half = seen.size[:2] / 2.0
-    middles = np.array([[half[0], 0.0], [-half[0], 0.0], [0.0, half[1]], [0.0, -half[1]]])
-    points = middles @ seen.T_base_object[:2, :2].T + seen.p_base[:2]
-    local = (points - stood.p_base[:2]) @ stood.T_base_object[:2, :2]
-    beyond = np.maximum(np.abs(local) - stood.size[:2] / 2.0, 0.0)
-    return float(np.linalg.norm(beyond, axis=1).max())
-
-
 def average(track: Sequence[Detection]) -> Detection:
     """Mean of sights of one box, whichever of its four equal descriptions each frame chose."""
     reference = track[-1]

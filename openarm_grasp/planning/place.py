@@ -22,12 +22,13 @@ from openarm_common.robot.work import Table
 from openarm_common.types import Array, Floats
 from openarm_common.wanted import describe, select
 from openarm_grasp.config import GraspConfig, PlaceConfig
-from openarm_grasp.evidence.verdicts import SQUARE_WITHIN
 from openarm_grasp.perception.detections import Frame, Sighting
 from openarm_grasp.perception.sightings import surface_of
 from openarm_grasp.planning.arms import Shoulders, sides
 from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, hold_of
 
+#: Edges of a footprint that differ by less are taken for equal, m; those of what is round are, too.
+_SQUARE_WITHIN = 0.006
 #: Spots nearer to each other than this are one, m.
 SAME_SPOT = 0.02
 #: What reaches farther from its middle is large, m: distances to it are those to its outline, and so much.
@@ -125,7 +126,7 @@ def _stands_alike(a: GraspCandidate, b: GraspCandidate, step: float) -> bool:
 
 def symmetry(target: Detection) -> float:
     """Turn after which a box looks the same, rad: half of one, a quarter for a square."""
-    return np.pi / 2.0 if abs(float(target.size[0] - target.size[1])) < SQUARE_WITHIN else np.pi
+    return np.pi / 2.0 if abs(float(target.size[0] - target.size[1])) < _SQUARE_WITHIN else np.pi
 
 
 def other_spots(ways: Sequence[PlaceTarget], used: Sequence[PlaceTarget]) -> tuple[PlaceTarget, ...]:
@@ -329,7 +330,7 @@ def grid(low: float, high: float, step: float) -> Array:
 
 
 def placing_error(label: str, target: PlaceTarget, frame: Frame) -> tuple[Array, float] | None:
-    """How far the camera sees a placed object from where the hand let it go, along the opening axis of the hand.
+    """How far the camera sees a placed prism from where the hand let it go, along the opening axis of the hand.
 
     Args:
         label: Label of the object.
@@ -337,9 +338,10 @@ def placing_error(label: str, target: PlaceTarget, frame: Frame) -> tuple[Array,
         frame: Observed since.
 
     Returns:
-        Unit direction (2,), base frame, and the distance along it, m; None when the object is not in the frame.
+        Unit direction (2,), base frame, and the distance along it, m; None when the object is not in the frame, or
+        has no sides that the hand centres.
     """
-    off = [(d.p_base - target.position)[:2] for d in frame.detections if d.label == label and d.measured]
+    off = [(d.p_base - target.position)[:2] for d in frame.detections if d.label == label and d.measured and d.kind]
     if not off:
         return None
     axis = target.T_base_tcp[:2, 1] / np.linalg.norm(target.T_base_tcp[:2, 1])

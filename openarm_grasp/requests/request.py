@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import LONGEST_TEXT, brief, check_length
 from openarm_grasp.config import DetectConfig
-from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
+from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict
 from openarm_grasp.perception.detections import Frame, Sighting, Spot, find
 from openarm_grasp.planning.arms import check_arm
 from openarm_grasp.requests.state_times import StateTime
@@ -163,19 +163,19 @@ class Proof:
     """Why a request counts as done: two kinds of evidence that do not depend on each other.
 
     Attributes:
-        gripper: That the hand held the object.
+        hand: That the hand held the object, or pushed it along.
         camera: That the object has left its place, or is seen where it was to be placed.
 
     Raises:
         OpenArmError: INTERNAL, when one of them says otherwise.
     """
 
-    gripper: GripperVerdict
+    hand: HandVerdict
     camera: CameraVerdict
 
     def __post_init__(self) -> None:
-        if not (self.gripper.ok and self.camera.ok):
-            text = f"success without evidence: gripper {self.gripper.reason!r}, camera {self.camera.reason!r}"
+        if not (self.hand.ok and self.camera.ok):
+            text = f"success without evidence: hand {self.hand.reason!r}, camera {self.camera.reason!r}"
             raise OpenArmError(Code.INTERNAL, text)
 
 
@@ -184,17 +184,6 @@ class Feasible:
     """Why a dry run says that a request can be done: it was planned to its end, and nothing was moved."""
 
     plan: str
-
-
-@dataclass(frozen=True)
-class PushedAside:
-    """Why a request for phase aside counts as done.
-
-    Attributes:
-        camera: That the object is seen elsewhere than before.
-    """
-
-    camera: CameraVerdict
 
 
 @dataclass(frozen=True)
@@ -237,7 +226,7 @@ class GraspOutcome:
     options: tuple[Option, ...] = ()
     state_times: tuple[StateTime, ...] = ()
     recording: str = ""
-    proof: Proof | Feasible | PushedAside | None = None
+    proof: Proof | Feasible | None = None
 
     def __post_init__(self) -> None:
         if self.code is Code.OK and (self.proof is None or (isinstance(self.proof, Feasible) and self.attempts > 0)):

@@ -18,7 +18,7 @@ from openarm_common.wanted import fits
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.drift import DriftWatch
-from openarm_grasp.evidence.verdicts import Evidence, GripperVerdict, Verdict, judge_grip
+from openarm_grasp.evidence.verdicts import Evidence, HandVerdict, Verdict, judge_grip
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
@@ -76,7 +76,7 @@ class Grasp:
         """Whether it was found on the cloud of the object, of which no box is known."""
         return self.candidate.apertures is not None and bool(self.sighting.clouds)
 
-    def judge(self, evidence: Evidence, config: HeldConfig, *, was_held: bool = False) -> GripperVerdict:
+    def judge(self, evidence: Evidence, config: HeldConfig, *, was_held: bool = False) -> HandVerdict:
         """What the gripper says: of a box by its width, of any other shape by the interval and by `closed`."""
         apertures = self.candidate.apertures
         return judge_grip(evidence, config, was_held=was_held, apertures=apertures, closed=self.closed)
@@ -94,7 +94,7 @@ class Placed:
     """
 
     target: PlaceTarget
-    gripper: GripperVerdict
+    gripper: HandVerdict
     reason: str
     failure: Verdict | None = None
 

@@ -21,7 +21,9 @@ from sensor_msgs.msg import PointCloud2
 from unique_identifier_msgs.msg import UUID
 from vision_msgs.msg import Detection3DArray
 
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.self_filter import SelfFilter, SelfFilterConfig
 from openarm_common.ros.actions import ActionClient, check_alive
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.detections import detections_from_msg
@@ -30,7 +32,8 @@ from openarm_common.ros.node import QOS_SENSOR, BaseNode, reliable
 from openarm_common.ros.tf import RobotStateListener
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import Silence
-from openarm_grasp.perception.detections import Frame
+from openarm_grasp.perception.boxes import with_points
+from openarm_grasp.perception.detections import Frame, in_base
 from openarm_grasp.robot.interface import Frames
 from openarm_grasp.ros.pad_listener import Pads
 
@@ -54,11 +57,14 @@ class GraphClients:
     Args:
         node: The node that owns subscriptions, clients and the timer.
         config: Parameters.
+        table_z: Height of the table top, base frame, m, until it is published.
     """
 
-    def __init__(self, node: BaseNode[Any], config: GraspConfig) -> None:
+    def __init__(self, node: BaseNode[Any], config: GraspConfig, table_z: float) -> None:
         self._node = node
         self._config = config
+        self.table_z = table_z
+        self._outline = SelfFilter(node.description, SelfFilterConfig())
         self.robot = RobotStateListener(node, node.description, joints=False, held_topic="/motion/attached_objects")
         self.pads = Pads(node)
         self._subscriptions: dict[str, tuple[Subscription, ...]] = {}
@@ -226,11 +232,18 @@ class GraphClients:
         return answer.result
 
     # --- observing
-    async def observe(self, count: int, topic: str, limit: float) -> Frames:
-        """Collect frames of detections that are taken from now on; `limit` is s of wall clock.
+    async def observe(self, count: int, topic: str, camera: str, limit: float) -> Frames:
+        """Collect frames of detections that are taken from now on, in the base frame.
+
+        Args:
+            count: Number of frames.
+            topic: Topic of the detector.
+            camera: Name of its camera.
+            limit: Longest wait, s of wall clock.
 
         Raises:
-            OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST.
+            OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST; NO_TRANSFORM, when the pose of
+                their frame is not known.
         """
         self._frames = []
         self._observing_since_ns, self._topic = self.now_ns, topic
@@ -242,12 +255,14 @@ class GraphClients:
                 raise
             seen = f"{len(self._frames)} of {count} frames came from {topic} within {limit:g} s"
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
-        return Frames(tuple(self._with_cloud(frame) for frame in self._frames[-count:]), self._frame_id)
+        base = self._node.description.base
+        frames = in_base(self._frames[-count:], lambda t_ns: self.robot.buffer.lookup(base, self._frame_id, t_ns))
+        return Frames(tuple(self._with_cloud(frame, camera) for frame in frames), base)
 
     def listen(self, topic: str) -> None:
         """Let a detector begin: the first frame comes up to 1.5 s later, as its camera rests without a subscriber."""
         if topic not in self._subscriptions:
-            points = topic.rpartition("/")[0] + "/" + POINTS
+            points = _points_of(topic)
             self._subscriptions[topic] = (
                 self._node.create_subscription(
                     Detection3DArray, topic, partial(self._on_detections, topic), reliable(5)
@@ -273,14 +288,22 @@ class GraphClients:
             while len(self._clouds) > _CLOUDS:
                 del self._clouds[next(iter(self._clouds))]
 
-    def _with_cloud(self, frame: Frame) -> Frame:
-        """Return a frame with its points in the base frame, where they came and the pose of their camera is known."""
-        message = self._clouds.get(frame.t_ns)
-        if message is None:
-            return frame
+    def _with_cloud(self, frame: Frame, camera: str) -> Frame:
+        """Return a frame with its points in the base frame, where the pose of their camera is known.
+
+        Where the detector publishes none, they are those that the camera would see of its boxes.
+        """
+        message, base, buffer = self._clouds.get(frame.t_ns), self._node.description.base, self.robot.buffer
         try:
-            T = self.robot.buffer.lookup(self._node.description.base, message.header.frame_id, frame.t_ns)
-            return replace(frame, cloud=labelled_cloud_from_msg(message).moved(T))
+            if message is not None:
+                T = buffer.lookup(base, message.header.frame_id, frame.t_ns)
+                return replace(frame, cloud=labelled_cloud_from_msg(message).moved(T))
+            mounted = load_cameras().get(camera)
+            if mounted is None or self.sees(_points_of(self._topic)):
+                return frame
+            T, lens = buffer.lookup(base, mounted.optical_frame, frame.t_ns), mounted.intrinsics
+            shapes = self._outline.shapes(buffer.joints_at(frame.t_ns), self.robot.tracker.held)
+            return with_points(frame, lens, T, self.table_z, self._outline.outline(lens, T, shapes))
         except OpenArmError as error:
             self._node.get_logger().warning(f"dropped the points of a frame: {error.message}")
             return frame
@@ -291,3 +314,8 @@ class GraphClients:
             for subscription in self._subscriptions.popitem()[1]:
                 self._node.destroy_subscription(subscription)
         self._clouds.clear()
+
+
+def _points_of(topic: str) -> str:
+    """Topic of the points of detections."""
+    return f"{topic.rpartition('/')[0]}/{POINTS}"

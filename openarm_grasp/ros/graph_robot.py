@@ -34,12 +34,13 @@ class GraphRobot:
     Args:
         node: The node that owns the clients.
         config: Parameters.
+        table_z: Height of the table top, base frame, m, until it is published.
     """
 
-    def __init__(self, node: BaseNode[Any], config: GraspConfig) -> None:
+    def __init__(self, node: BaseNode[Any], config: GraspConfig, table_z: float) -> None:
         self._node = node
         self._config = config
-        self._nodes = GraphClients(node, config)
+        self._nodes = GraphClients(node, config, table_z)
         self._holder = Holder(node)
         self._plan = ActionClient(node, PlanApproach, "/motion/plan_approach")
         self._execute = ActionClient(node, ExecuteTrajectory, "/motion/execute")
@@ -81,7 +82,12 @@ class GraphRobot:
 
     def follow_table(self, on_height: Callable[[float], None]) -> None:
         """Call a function with the height of the table, base frame, m, whenever it is published."""
-        self._nodes.robot.follow_table(on_height)
+
+        def take(height: float) -> None:
+            self._nodes.table_z = height
+            on_height(height)
+
+        self._nodes.robot.follow_table(take)
 
     def follow_mounts(self, on_mounts: Callable[[dict[str, CameraConfig]], None]) -> None:
         """Call a function with the cameras, by name, whenever one with a housing is mounted elsewhere."""
@@ -196,11 +202,11 @@ class GraphRobot:
     async def observe(self, count: int, *, near: str = "") -> Frames:
         """Frames of detections that are taken from now on."""
         if not near:
-            return await self._nodes.observe(count, DETECTIONS, self._config.detect.frame_timeout)
+            return await self._nodes.observe(count, DETECTIONS, self._config.camera, self._config.detect.frame_timeout)
         topic = self._config.near.topic.format(camera=near)
         if not self._nodes.sees(topic):
             raise OpenArmError(Code.NOT_READY, f"no node publishes {topic}")
-        return await self._nodes.observe(count, topic, self._config.near.timeout)
+        return await self._nodes.observe(count, topic, near, self._config.near.timeout)
 
     def expect_near(self, camera: str) -> None:
         """Wake the detector of the camera on the hand."""

@@ -60,7 +60,7 @@ class GraspNode(BaseNode[GraspConfig]):
         super().__init__("grasp", GraspConfig, **kwargs)
         make_sampler(self.config.sampler)  # one that does not exist is refused now
         context = GraspContext.of(self.config, load_scene(self.config.scene).table, self.description)
-        self._robot = GraphRobot(self, self.config)
+        self._robot = GraphRobot(self, self.config, context.table.top_z)
         self._skills = Skills(self._robot, self.config)
         self._session = GraspSession(context)
         self._flight_recorder = FlightRecorderClient(self)

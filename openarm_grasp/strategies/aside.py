@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Push an object away from where it is, whether a hand can grasp it or not: what it hides or blocks comes free.
 
-A plate that no hand can close on may lie on a spoon. Of lines that move the fewest other things the longest is taken;
-the camera says how far the object has moved. Base frame, m.
+A plate that no hand can close on may lie on a spoon. Of lines that move the fewest other things the longest is taken.
+That it has moved say the hand, which has gone along its line, and the camera. Base frame, m.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from dataclasses import replace
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_grasp.evidence.verdicts import CameraVerdict
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.requests.request import Feasible, GraspOutcome, PushedAside
+from openarm_grasp.requests.request import Feasible, GraspOutcome
 from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.find import detect
+from openarm_grasp.strategies.pick_and_place import succeeded
 from openarm_grasp.strategies.pushing import agree_to_push, carry_out_push, plan_sweep
 from openarm_grasp.strategies.run import Run
 
@@ -55,12 +55,12 @@ async def _pushed(run: Run, found: Sighting) -> GraspOutcome:
             return run.answer(Code.OK, f"can be done: {planned}", Feasible(str(planned)))
         await agree_to_push(task, planned, found)
         run.arm = planned.arm
-        pushed, text = await carry_out_push(task, planned, found, number)
+        pushed, text, hand, camera = await carry_out_push(task, planned, found, number)
         task.displaced = "after the pushes"
         run.seen_at = pushed.target.p_base
         task.findings.sighting = run.findings.sighting = pushed
-        if planned.moves(found.target, pushed.target):
-            return run.answer(Code.OK, text, PushedAside(CameraVerdict(Code.OK, text)))
+        if planned.moves(found.target, pushed.target) and hand.ok and camera.ok:
+            return succeeded(run, text, hand=hand, camera=camera)
         avoid.append(planned.ahead)
         found = pushed
     raise OpenArmError(Code.PLACE_FAILED, f"{text}; it does not move aside")

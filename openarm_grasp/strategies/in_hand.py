@@ -7,20 +7,28 @@ that press on something hold it; what that is, the planner knows when it carried
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.verdicts import Evidence, learn_command
+from openarm_grasp.perception.boxes import points_of
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, object_in
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.task import Grasp, GraspSession, release_command
 from openarm_grasp.robot.learn import CLOSED
 from openarm_grasp.robot.skills import Skills
+
+#: What no camera has seen is looked at from straight above, m.
+_ABOVE = 0.7
 
 
 async def take_up(session: GraspSession, robot: Skills, *requests: GraspRequest) -> None:
@@ -69,9 +77,8 @@ def _grasp_of(arm: str, box: Box, evidence: Evidence, T_base_tcp: Array, context
     """The grasp that holds a box (TCP frame), as if the object had stood on the table below the hand."""
     size, T_tcp_object = object_in(box, context.config)
     x, y, _ = (T_base_tcp @ T_tcp_object)[:3, 3]
-    target = Detection(
-        box.id.removeprefix("target/"), 1.0, se3.make(p=(x, y, context.table.top_z + float(size[2]) / 2.0)), size
-    )
+    T_base_object = se3.make(p=(x, y, context.table.top_z + float(size[2]) / 2.0))
+    target = Detection(box.id.removeprefix("target/"), 1.0, T_base_object, size, kind="box")
     T_grasp = target.T_base_object @ se3.inverse(T_tcp_object)
     approach = context.config.approach
     tilt = float(np.arccos(np.clip(-T_grasp[2, 2], -1.0, 1.0)))
@@ -85,4 +92,12 @@ def _grasp_of(arm: str, box: Box, evidence: Evidence, T_base_tcp: Array, context
         score=0.0,
         parts={},
     )
-    return Grasp(arm, Sighting(target, (), 0), candidate, ())
+    return Grasp(arm, Sighting(target, (), 0, (_seen_from_above(target),)), candidate, ())
+
+
+def _seen_from_above(target: Detection) -> LabelledCloud:
+    """Points of a box as a camera above it would see them; it may have no corners: its points are those within."""
+    T_base_camera = se3.make(np.diag([1.0, -1.0, -1.0]), target.foot + _ABOVE * UP)
+    cloud = points_of((target,), Intrinsics.from_fovy(640, 480, 60.0), T_base_camera, target.bottom)
+    local = (cloud.points[:, :2] - target.p_base[:2]) @ target.T_base_object[:2, :2] / (0.5 * target.size[:2])
+    return replace(cloud, labels=np.where(np.linalg.norm(local, axis=1) < 1.0, cloud.labels, 0).astype(np.uint32))

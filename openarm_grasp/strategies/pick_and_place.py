@@ -10,7 +10,6 @@ Base frame, m.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -18,15 +17,11 @@ import numpy as np
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence import verdicts
-from openarm_grasp.evidence.shapes import heavier_end, judge_gone, judge_held, judge_unmoved
-from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict, Verdict
-from openarm_grasp.perception.clouds import lifted, risen_points
-from openarm_grasp.perception.detections import Frame, apart
-from openarm_grasp.perception.sightings import first_points, object_points, points_around
+from openarm_grasp.evidence.camera import judge_unmoved
+from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict, Verdict, judge_lift
+from openarm_grasp.perception.detections import apart
+from openarm_grasp.perception.sightings import first_points, object_points
 from openarm_grasp.planning.candidates import PlaceTarget
-from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import other_spots, place_targets
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
@@ -34,11 +29,11 @@ from openarm_grasp.requests.states import Hand, State
 from openarm_grasp.requests.task import Grasp, Placed, Task
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
-from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place, regrasped
+from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place
 from openarm_grasp.strategies.retreat import retreat, still_held
 from openarm_grasp.strategies.run import Run
 from openarm_grasp.strategies.second_look import second_look
-from openarm_grasp.strategies.verify import verify
+from openarm_grasp.strategies.verify import judge_lifted, verify
 
 #: After these another observation would wait for frames that do not come.
 _BLIND = (Code.NOT_READY, Code.STALE_DATA, Code.TIMEOUT)
@@ -110,7 +105,7 @@ async def _attempts(run: Run) -> GraspOutcome:
                 grasp, why = await close(run, grasp, why)
                 grasp, gripper, camera, why = await lift(run, grasp, plan, why)
                 if run.request.phase == "pick":
-                    return succeeded(run, f"{why}; the {run.arm} hand keeps it", gripper=gripper, camera=camera)
+                    return succeeded(run, f"{why}; the {run.arm} hand keeps it", hand=gripper, camera=camera)
             placed = await place(run, grasp, why)
             run.enter(State.RESET, placed.reason)
         except ObjectKeptError:
@@ -127,7 +122,7 @@ async def _attempts(run: Run) -> GraspOutcome:
                 position = (run.place_target or placed.target).position
                 run.task.session.note_placed(position, grasp.sighting.target.id)
                 text = f"{seen.reason}, placed by the {run.arm} arm"
-                return succeeded(run, text, gripper=placed.gripper, camera=seen)
+                return succeeded(run, text, hand=placed.gripper, camera=seen)
             run.failure = seen
         why = run.start_again(grasp, placed)
         run.robot.set_speed(run.request.velocity_scale, run.tried)
@@ -140,19 +135,19 @@ async def _see_where_it_is(run: Run) -> None:
         run.seen_at = run.request.find(frames, run.config.detect).target.p_base
 
 
-def succeeded(run: Run, message: str, *, gripper: GripperVerdict, camera: CameraVerdict) -> GraspOutcome:
+def succeeded(run: Run, message: str, *, hand: HandVerdict, camera: CameraVerdict) -> GraspOutcome:
     """Say that what was asked for has happened: the only place that can.
 
     Args:
         run: The request.
         message: How, in a sentence.
-        gripper: That the hand held the object.
+        hand: That the hand held the object, or pushed it along.
         camera: That the object has left its place, or is seen where it was to be placed.
 
     Raises:
         OpenArmError: INTERNAL, when one of them says otherwise.
     """
-    return run.answer(Code.OK, message, Proof(gripper, camera))
+    return run.answer(Code.OK, message, Proof(hand, camera))
 
 
 # --- approach
@@ -183,7 +178,7 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
         grasp, plan, why = await _correct(run, grasp, plan, camera)
     run.enter(State.MOVE_TO_GRASP, why)
     target = grasp.sighting.target
-    still, why = _still(grasp, (await robot.observe(1)).frames, config)
+    still, why = judge_unmoved(first_points(grasp.sighting), (await robot.observe(1)).frames)
     if not still and run.suspected is not None and apart(target, run.suspected) < config.detect.agree_within:
         still, why = True, f"{why}; so it seemed before, and it had not: the hand hides a part of it"
     run.suspected = target
@@ -234,13 +229,6 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[
     return corrected, plan, "the open hand is before the object"
 
 
-def _still(grasp: Grasp, frames: Sequence[Frame], config: GraspConfig) -> tuple[bool, str]:
-    """Whether the object still stands where it was seen; where no points are known, boxes are compared."""
-    if grasp.of_cloud or (grasp.sighting.clouds and any(frame.cloud is not None for frame in frames[-1:])):
-        return judge_unmoved(first_points(grasp.sighting), frames)
-    return verdicts.judge_still(grasp.sighting.target, frames, config.held)
-
-
 # --- grasp
 async def close(run: Run, grasp: Grasp, why: str) -> tuple[Grasp, str]:
     """Pause, close until the fingers stop, let them settle, and judge by them whether they hold the object.
@@ -272,7 +260,7 @@ async def close(run: Run, grasp: Grasp, why: str) -> tuple[Grasp, str]:
     return grasp, gripper.reason
 
 
-async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, GripperVerdict, CameraVerdict, str]:
+async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, HandVerdict, CameraVerdict, str]:
     """Lift straight up, then judge by gripper and camera whether the object has come along.
 
     Returns:
@@ -281,7 +269,7 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
     Raises:
         OpenArmError: When they do not agree that it has.
     """
-    arm, robot, config, sighting = grasp.arm, run.robot, run.config, grasp.sighting
+    arm, robot, config = grasp.arm, run.robot, run.config
     run.enter(State.LIFT, why)
     top = grasp.candidate.T_base_tcp[:3, 3] + grasp.candidate.retreat_offset
 
@@ -301,33 +289,10 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
     frames = await robot.observe_towards_end(rise, lambda: sag() <= _ARRIVING, _LIFT_FRAMES)
     evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
     gripper = grasp.judge(evidence, config.held, was_held=True)
-    if grasp.of_cloud:
-        T, points = robot.T_base_tcp(arm), risen_points(frames, sighting, config.held.rise)
-        T_before = grasp.candidate.T_base_tcp
-        moved = T @ se3.inverse(T_before)
-        thing = lifted(frames, sighting, points, moved, T_before[:3, 3])
-        if thing is not sighting:
-            grasp = run.grasp = regrasped(run, grasp, thing)
-        camera = judge_gone(first_points(thing), frames)
-        if camera.ok:
-            before = np.concatenate([object_points(sighting.clouds), points_around(sighting.clouds)])
-            where = judge_held(columns(before, run.context.table.top_z), points, moved, config.held)
-            if not where.ok:
-                heavy = heavier_end(object_points(thing.clouds), points, T)
-                run.grasp = grasp = replace(grasp, turned=True, heavy=heavy)
-                camera = where
-    else:
-        camera = verdicts.judge_sight(
-            sighting.target,
-            frames,
-            config.held,
-            match_radius=config.detect.match_radius,
-            others=sighting.others,
-            lift=float(grasp.candidate.retreat_offset[2]),
-        )
-    verdict = verdicts.judge_lift(gripper, camera)
+    grasp, camera = judge_lifted(run, grasp, frames)
+    verdict = judge_lift(gripper, camera)
     # what is hidden after the lift may be seen at the place
-    hidden = grasp.of_cloud and bool(frames) and verdict.code is Code.STALE_DATA and run.request.phase == "all"
+    hidden = bool(frames) and verdict.code is Code.STALE_DATA and run.request.phase == "all"
     if not verdict.ok and not hidden:
         run.hand = Hand.HOLDING if gripper.ok else Hand.AT_OBJECT
         raise OpenArmError(verdict.code, verdict.reason)

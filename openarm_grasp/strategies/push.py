@@ -57,7 +57,7 @@ async def push(task: Task) -> GraspOutcome | None:
             return replace(refused, code=Code.OK, message=f"can be done: {planned}", proof=Feasible(str(planned)))
         await agree_to_push(task, planned, found)
         try:
-            pushed, observed = await carry_out_push(task, planned, found, number)
+            pushed, observed, *_ = await carry_out_push(task, planned, found, number)
         except OpenArmError as error:
             return replace(refused, code=error.code, message=error.message)
         task.displaced = "after the pushes"

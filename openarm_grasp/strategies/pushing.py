@@ -16,8 +16,10 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from openarm_grasp.evidence.camera import judge_unmoved
+from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict, judge_path
 from openarm_grasp.perception.detections import Sighting, apart
-from openarm_grasp.perception.sightings import seen_at
+from openarm_grasp.perception.sightings import first_points, seen_at
 from openarm_grasp.planning.candidates import GraspCandidate
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.pushes import closed_hand, direction, push_ways, sweeps
@@ -64,9 +66,14 @@ class Push:
         """(2,) direction."""
         return direction(self.end - self.start)
 
+    @property
+    def least(self) -> float:
+        """How far an object moves at least that goes along, and does not stay or slide past the hand, m."""
+        return _FOLLOWS * float(np.linalg.norm(self.end - self.start))
+
     def moves(self, before: Detection, after: Detection) -> bool:
-        """Whether the object went along, and did not stay or slide past the hand."""
-        return apart(before, after) >= _FOLLOWS * float(np.linalg.norm(self.end - self.start))
+        """Whether the object went along."""
+        return apart(before, after) >= self.least
 
 
 async def plan_sweep(
@@ -125,14 +132,20 @@ async def agree_to_push(task: Task, planned: Push, found: Sighting) -> None:
         raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning again')}; ask again")
 
 
-async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int) -> tuple[Sighting, str]:
-    """Push, go home and observe; returns the object as it was observed, and a sentence.
+async def carry_out_push(
+    task: Task, planned: Push, found: Sighting, number: int
+) -> tuple[Sighting, str, HandVerdict, CameraVerdict]:
+    """Push, go home and observe.
 
     Args:
         task: That it is a part of.
         planned: The push.
         found: The object and its neighbours before.
         number: Of the push, 1-based.
+
+    Returns:
+        The object as it was observed, a sentence, whether the hand has gone as far as what follows it has moved, and
+        whether the object has left its place.
 
     Raises:
         OpenArmError: EXECUTION_FAILED or HAND_COLLISION, when the hand did not do it; what observing raises, when the
@@ -142,15 +155,19 @@ async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int
     task.attempts = max(task.attempts, 1)
     task.note(f"push {number} of at most {config.push.most}: {planned}")
     T_base_back, fault, short = way.T_base_tcp, None, ""
+    hand = HandVerdict(Code.EXECUTION_FAILED, "the hand did not go")
     try:
         await _go_behind(task, planned)
+        start = robot.T_base_tcp(arm)[:3, 3]
         try:
             await robot.follow(arm, planned.plan.retreat, "push")
         except OpenArmError as error:
             if error.code is not Code.EXECUTION_FAILED:
                 raise
             short = f"; {error.message}"  # what was pushed has moved all the same: that is observed
-        T_base_back = se3.make(p=-config.push.gap * direction(way.retreat_offset)) @ robot.T_base_tcp(arm)
+        T_base_tcp = robot.T_base_tcp(arm)
+        hand = judge_path(start, T_base_tcp[:3, 3], way.retreat_offset, config.push.gap + planned.least)
+        T_base_back = se3.make(p=-config.push.gap * direction(way.retreat_offset)) @ T_base_tcp
     except OpenArmError as error:
         fault = error
     if fault is None or fault.code not in STOPS:
@@ -174,7 +191,8 @@ async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int
         f" from its destination{short}"
     )
     task.note(text)
-    return pushed, text
+    still, seen = judge_unmoved(first_points(found), frames)
+    return pushed, text, hand, CameraVerdict(Code.PLACE_FAILED if still else Code.OK, seen)
 
 
 async def _go_behind(task: Task, planned: Push) -> None:

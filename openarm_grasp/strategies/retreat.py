@@ -103,7 +103,7 @@ async def _put_back(run: Run, grasp: Grasp) -> None:
     arm, robot, config, candidate = grasp.arm, run.robot, run.config, grasp.candidate
     above, slipped = config.place.release_height, run.failure is not None and run.failure.code is Code.GRASP_LOST
     if slipped:
-        above += 2.0 * config.held.slip_along  # it reaches lower than it did
+        above += 2.0 * config.held.askew  # it reaches lower than it did
     T_back = se3.make(p=above * candidates.UP) @ candidate.T_base_tcp
     try:
         try:

@@ -16,7 +16,7 @@ from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.offers import asked, offers
 from openarm_grasp.planning.options import Options
 from openarm_grasp.requests.confirm import ShownPlan
-from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof, PushedAside
+from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.requests.states import Hand, State, check_transition
 from openarm_grasp.requests.task import Findings, Grasp, Placed, Status, Task
 from openarm_grasp.robot.interface import Planned
@@ -169,7 +169,7 @@ class Run:
         task.report(replace(about, code=outcome.code.value))
         return outcome
 
-    def answer(self, code: Code, message: str, proof: Proof | Feasible | PushedAside | None = None) -> GraspOutcome:
+    def answer(self, code: Code, message: str, proof: Proof | Feasible | None = None) -> GraspOutcome:
         """The answer to the request."""
         x, y, z = (float(v) for v in (self.place_target.position if self.place_target else (0.0, 0.0, 0.0)))
         seen = (

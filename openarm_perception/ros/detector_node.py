@@ -107,7 +107,8 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._objects = self.create_publisher(Detection3DArray, "/detections_3d", reliable(5))
         self._picture = self.create_publisher(Image, "/detection_image", QOS_SENSOR)
         self._mask = self.create_publisher(Image, "/detection_mask", QOS_SENSOR)
-        self._clouds = self.create_publisher(PointCloud2, "/detection_points", QOS_SENSOR)
+        # without depth there are no points, and whoever needs some makes them of the boxes
+        self._clouds = self.create_publisher(PointCloud2, "/detection_points", QOS_SENSOR) if depth else None
         self._markers = self.create_publisher(MarkerArray, "/detection_markers", reliable(5))
         self.create_timer(0.1, self._follow_demand, clock=self.steady_clock)
         self.diagnose(True, "idle: no subscribers", **self._counts)
@@ -163,7 +164,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._stream.poll()
         outputs = (self._boxes, self._objects, self._picture, self._mask, self._clouds, self._markers)
         asked = time.monotonic() < self._asked_until
-        wanted = asked or any(output.get_subscription_count() for output in outputs)
+        wanted = asked or any(output.get_subscription_count() for output in outputs if output is not None)
         if wanted != self._stream.listening:
             self._stream.listen(wanted)
             self._listens_since = time.monotonic()
@@ -201,7 +202,8 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         except OpenArmError as error:
             self._refuse(error)
             return
-        if self._clouds.get_subscription_count():  # first, so that whoever waits for the objects has them
+        # first, so that whoever waits for the objects has them
+        if self._clouds is not None and self._clouds.get_subscription_count():
             self._clouds.publish(labelled_cloud_to_msg(cloud, self._optical_frame, frame.t_ns))
         self._publish(frame.t_ns, rgb, perceived, (time.perf_counter() - started) * 1e3)
 

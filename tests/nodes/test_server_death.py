@@ -210,7 +210,7 @@ def test_a_call_of_a_service_ends_when_its_node_is_killed(ros, children, undisco
 @pytest.mark.requirement("R-21")
 def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> None:
     node = ros.add(BaseNode("grasp", Config))
-    clients = GraphClients(node, GraspConfig())
+    clients = GraphClients(node, GraspConfig(), 0.4)
     clients._silence.check = lambda _: None  # there is no robot
     clients._timer.reset()
     client = ActionClient(node, FollowJointTrajectory, NAME)

@@ -23,6 +23,7 @@ from openarm_common.camera.housings import mounted
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.robot.self_filter import SelfFilter, SelfFilterConfig
 from openarm_common.scene.scene import Scene
 from openarm_evaluation.campaign.in_process_robot import InProcessRobot
 from openarm_evaluation.campaign.robot import SimulatedSenses, together, turn
@@ -32,6 +33,7 @@ from openarm_evaluation.judging.trial import Step
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.perception.boxes import with_points
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest
@@ -46,6 +48,19 @@ from tests.openarm_grasp.tape import Call, Tape, packed, unpacked
 _SAME = 1e-4
 #: So many of the ways that were offered must be offered again; of those at the edge of a limit, rounding decides.
 _MOST = 0.9
+
+
+def _with_points(robot: Any, seen: Frames, camera: str) -> Frames:
+    """Frames that have no points with those of their boxes."""
+    made, mounted = list(seen.frames), load_cameras()[camera]
+    robot_filter = SelfFilter(robot.description, SelfFilterConfig())
+    for k, frame in enumerate(made):
+        if frame.cloud is None:
+            T = robot.states.lookup(robot.base_frame, mounted.parent, frame.t_ns) @ mounted.T_parent_optical
+            shapes = robot_filter.shapes(robot.states.joints_at(min(frame.t_ns, robot.states.latest()[0])))
+            outline = robot_filter.outline(mounted.intrinsics, T, shapes)
+            made[k] = with_points(frame, mounted.intrinsics, T, 0.4, outline)
+    return replace(seen, frames=tuple(made))
 
 
 def _asked(request: PlanGrasp | PlanPlace) -> tuple[list[Any], np.ndarray]:
@@ -142,7 +157,8 @@ class SimulatedRobot(InProcessRobot):
             seen = replace(seen, frames=tuple(replace(frame, cloud=None) for frame in seen.frames))
         arrays: list[np.ndarray] = []  # the strategy gets what will be read
         kept = packed(seen, arrays)
-        return self._end(call, unpacked(kept, {f"array{k}": array for k, array in enumerate(arrays)}))
+        kept = self._end(call, unpacked(kept, {f"array{k}": array for k, array in enumerate(arrays)}))
+        return _with_points(self, kept, near or self._config.camera)
 
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         words, poses = _asked(request)
@@ -313,7 +329,8 @@ class RecordedRobot:
             await turn()
 
     async def observe(self, count: int, *, near: str = "") -> Frames:
-        return await self._answer(self._next("observe", count, near))
+        seen = await self._answer(self._next("observe", count, near))
+        return _with_points(self, seen, near or self._config.camera)
 
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         words, poses = _asked(request)

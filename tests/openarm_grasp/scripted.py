@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
@@ -19,6 +20,7 @@ from openarm_common.robot.zeros import HandReach
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.verdicts import Evidence
+from openarm_grasp.perception.boxes import with_points
 from openarm_grasp.perception.detections import Frame
 from openarm_grasp.perception.sightings import standing_at
 from openarm_grasp.planning.candidates import Box
@@ -33,6 +35,8 @@ from openarm_grasp.strategies.registry import carry_out
 
 #: How far either arm reaches over the middle, m.
 OVER = 0.10
+#: A camera over the table.
+LENS, T_BASE_CAMERA = Intrinsics.from_fovy(640, 480, 60.0), se3.make(np.diag([1.0, -1.0, -1.0]), (0.35, 0.0, 1.2))
 
 
 # --- what a robot was asked
@@ -100,6 +104,11 @@ Fault = Callable[[Call], OpenArmError | None]
 
 class Path(str):
     """A trajectory: of two with the same name each is itself."""
+
+
+def frame_of(*found: Detection, t_ns: int = 1) -> Frame:
+    """What the camera over the table sees of boxes."""
+    return with_points(Frame(t_ns, found), LENS, T_BASE_CAMERA, 0.4)
 
 
 def standing(label: str, x: float, y: float, size: float = 0.05, z: float = 0.4) -> Detection:
@@ -239,7 +248,7 @@ class World(Skills):
             return seen
         T_off = se3.make(p=(self.near_off, 0.0, 0.0))
         shifted = (replace(d, T_base_object=T_off @ d.T_base_object) for d in seen.frames[-1].detections)
-        return Frames((replace(seen.frames[-1], detections=tuple(shifted)),) * count, seen.frame_id)
+        return Frames((frame_of(*shifted, t_ns=seen.frames[-1].t_ns),) * count, seen.frame_id)
 
     async def observe_towards_end(
         self, motion: Callable[[], Awaitable[None]], near_end: Callable[[], bool], count: int
@@ -385,11 +394,10 @@ class World(Skills):
         self.objects["red"] = standing_at(self.objects["red"], self.objects["red"].p_base[:2] + way[:2])
 
     def frames(self, count: int) -> Frames:
-        seen = tuple(replace(d, id=name) for name, d in self.objects.items())
-        found = []
+        seen, found = frame_of(*(replace(d, id=name) for name, d in self.objects.items())), list[Frame]()
         for _ in range(count):
             self.pass_time(0.1)
-            found.append(Frame(self.t_ns - round(self.frame_age * 1e9), seen))
+            found.append(replace(seen, t_ns=self.t_ns - round(self.frame_age * 1e9)))
         return Frames(tuple(found), "base")
 
     def pass_time(self, seconds: float) -> None:

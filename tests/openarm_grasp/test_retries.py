@@ -16,7 +16,7 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.shapes import heavier_end
+from openarm_grasp.evidence.camera import heavier_end
 from openarm_grasp.planning.candidates import propose
 from openarm_grasp.planning.retries import FailedGrasp, among, centre_of_mass, proposed
 from openarm_grasp.requests.states import State

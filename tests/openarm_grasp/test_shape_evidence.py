@@ -13,7 +13,7 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.evidence.shapes import judge_gone, judge_held, judge_moved, judge_unmoved, stays
+from openarm_grasp.evidence.camera import judge_gone, judge_held, judge_moved, judge_unmoved, stays
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
 from openarm_grasp.perception.clouds import came_next_to, lifted, risen_points, shown_at
 from openarm_grasp.perception.detections import Frame, Sighting

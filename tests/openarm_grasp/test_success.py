@@ -11,10 +11,10 @@ import pytest
 
 import openarm_grasp
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
+from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict
 from openarm_grasp.requests.request import Feasible, GraspOutcome, Proof
 
-HELD = GripperVerdict(Code.OK, "held")
+HELD = HandVerdict(Code.OK, "held")
 AT_PLACE = CameraVerdict(Code.OK, "2 mm from its target")
 
 
@@ -23,10 +23,10 @@ AT_PLACE = CameraVerdict(Code.OK, "2 mm from its target")
 @pytest.mark.requirement("P-08")
 def test_a_lift_is_proven_by_a_hand_that_holds_and_a_camera_that_sees_the_object_gone(grip, sight):
     if grip is Code.OK and sight is Code.OK:
-        Proof(GripperVerdict(grip, "a"), CameraVerdict(sight, "b"))
+        Proof(HandVerdict(grip, "a"), CameraVerdict(sight, "b"))
         return
     with pytest.raises(OpenArmError, match="success without evidence") as error:
-        Proof(GripperVerdict(grip, "a"), CameraVerdict(sight, "b"))
+        Proof(HandVerdict(grip, "a"), CameraVerdict(sight, "b"))
     assert error.value.code is Code.INTERNAL
 
 
@@ -55,7 +55,7 @@ def test_one_function_builds_the_proof_of_a_success_and_it_cannot_be_called_with
                 calls = [n.func.id for n in ast.walk(node) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
                 found += [node.name] * calls.count("Proof")
                 if node.name == "succeeded":
-                    assert [arg.arg for arg in node.args.kwonlyargs] == ["gripper", "camera"]
+                    assert [arg.arg for arg in node.args.kwonlyargs] == ["hand", "camera"]
                     assert node.args.kw_defaults == [None, None]
     assert found == ["succeeded"]
 
@@ -64,8 +64,8 @@ def test_one_function_builds_the_proof_of_a_success_and_it_cannot_be_called_with
 def test_the_answers_of_a_pick_and_of_a_place_carry_their_proof(world):
     picked = world.grasp(phase="pick")
     assert isinstance(picked.proof, Proof)
-    assert picked.proof.camera.reason == "'red' has gone from its place"
+    assert picked.proof.camera.reason == "it has gone from its place"
     placed = world.grasp("", phase="place")
     assert isinstance(placed.proof, Proof)
-    assert placed.proof.camera.reason == "'red' stands 0 mm from its target"
-    assert placed.proof.gripper.ok
+    assert placed.proof.camera.reason == "its middle is seen 0 mm from its target"
+    assert placed.proof.hand.ok

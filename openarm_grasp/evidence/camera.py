@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a camera says of a thing of any shape: whether it has left its place, and stands where it should.
+"""What a camera says of an object: whether it has left its place, hangs in the hand, and stands where it should.
 
-A box that is fitted to a shape that is none changes with the view. So its points are judged: how many of them are
-seen, seen through, or hidden, where it stood or where the hand has moved it. What the border of the image or the robot
-hides proves nothing: neither that a thing is there, nor that it has gone.
+Its points are judged, whatever its shape: how many of them are seen, seen through, or hidden, where it stood or where
+the hand has moved it. What the border of the image or the robot hides proves nothing: neither that an object is there,
+nor that it has gone.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 
 from openarm_common import se3
 from openarm_common.errors import Code
+from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict
@@ -24,8 +25,8 @@ from openarm_world.shares import explain, fit, view_of
 
 #: From which shares on an object is judged, and has left its place.
 _WORLD = WorldConfig()
-#: A thing that rests as it rested is as high as before, m.
-_HEIGHT = 0.005
+#: What rests as it rested is as high as before, m.
+AS_HIGH = 0.005
 #: What has moved by 8 mm, or rests otherwise, is seen through by more than this share; what stands under a hand is not.
 _MOVED = 0.1
 #: What is less in view is not judged: from another side, a third may be.
@@ -147,6 +148,7 @@ def judge_moved(
 
     Returns:
         How it has moved as it is seen (4, 4), and the verdict; final where it has fallen over, or is another shape.
+        What is not there at all may be elsewhere.
     """
     if frame.cloud is None or not len(before):
         return T_motion, CameraVerdict(Code.STALE_DATA, "no points of what stands where it was put down")
@@ -157,9 +159,9 @@ def judge_moved(
     if shares.in_view < _SHOWN:
         text = f"{shares.in_view:.0%} of what was seen of it is in view after the place, expected at least {_SHOWN:.0%}"
     elif shares.left > _MOVED:
-        final, limit = not in_part, f"expected at most {_MOVED:.0%}"
+        final, limit = not in_part and shares.left < _WORLD.gone, f"expected at most {_MOVED:.0%}"
         text = f"the object does not rest as it did: {shares.left:.0%} of what was seen of it is not there, {limit}"
-    elif abs(higher) > _HEIGHT:
+    elif abs(higher) > AS_HIGH:
         final, way = not in_part, "higher" if higher > 0.0 else "lower"
         text = f"the object does not rest as it did: it is {abs(higher) * 1e3:.0f} mm {way} than it was"
     elif off > within:
@@ -167,3 +169,18 @@ def judge_moved(
     else:
         return T, CameraVerdict(Code.OK, text)
     return T, CameraVerdict(Code.PLACE_FAILED, text, final=final)
+
+
+def judge_same(seen: Array, T_motion: Array, before: LabelledCloud) -> CameraVerdict:
+    """Whether what is seen of an object at its place was seen of it before: what leans or lies reaches elsewhere.
+
+    Args:
+        seen: (n, 3) points of it at its place.
+        T_motion: (4, 4) how it has moved there.
+        before: The image of it before the grasp; what that saw through was free.
+    """
+    shares = explain(seen, se3.inverse(T_motion), view_of(before.points, before.camera))
+    if shares.left > _MOVED:
+        what = f"{shares.left:.0%} of what is seen of it was free before, expected at most {_MOVED:.0%}"
+        return CameraVerdict(Code.PLACE_FAILED, f"the object does not rest as it did: {what}", final=True)
+    return CameraVerdict(Code.OK, "it rests as it did")
