@@ -159,7 +159,7 @@ def judge_moved(
     if shares.in_view < _SHOWN:
         text = f"{shares.in_view:.0%} of what was seen of it is in view after the place, expected at least {_SHOWN:.0%}"
     elif shares.left > _MOVED:
-        final, limit = not in_part and shares.left < _WORLD.gone, f"expected at most {_MOVED:.0%}"
+        final, limit = not in_part and bool(shares.left < _WORLD.gone), f"expected at most {_MOVED:.0%}"
         text = f"the object does not rest as it did: {shares.left:.0%} of what was seen of it is not there, {limit}"
     elif abs(higher) > AS_HIGH:
         final, way = not in_part, "higher" if higher > 0.0 else "lower"

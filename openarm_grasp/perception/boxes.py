@@ -61,7 +61,7 @@ def points_of(
             R = box.T_base_object[:3, :3]
             ends = (planes - (camera - box.p_base) @ R) / (rays[where] @ R)
             enter, leave = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
-            hit = (0.0 < enter) & (enter <= leave) & (enter < depth[where])
+            hit = (enter > 0.0) & (enter <= leave) & (enter < depth[where])
             depth[where][hit], labels[where][hit] = enter[hit], number
     kept = labels > 0
     kept[::_STEP, ::_STEP] = True

@@ -51,14 +51,14 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
     """Return the points (n, 3) of what the newest image shows over the place of a thing, higher than it stood.
 
     What is seen where something was before is left out: what stood around it may be higher, too, and what was taken for
-    a part of it may have stayed.
+    a part of it may have stayed. A prism is one body, and known down to its foot.
 
     Args:
         frames: In the base frame.
         sighting: The thing as it stood.
-        rise: Its upper end is at least this much higher, m.
+        rise: Its upper end is at least this much higher, of a prism its lower end, m.
     """
-    before = object_points(sighting.clouds[-1:])
+    before, target = object_points(sighting.clouds[-1:]), sighting.target
     place, top, middle = KDTree(before[:, :2]), _top(before), before.mean(axis=0)
     frame = next((frame for frame in reversed(frames) if frame.cloud is not None), None)
     found = [np.empty((0, 3))]
@@ -69,12 +69,13 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
                 continue
             # of what hangs in a hand an end may be all that is seen; a few points that fly make it no neighbour
             beside = float(np.percentile(place.query(points[:, :2])[0], 2.0))
-            if _top(points) - top >= rise and beside <= _OVER:
+            risen = float(np.percentile(points[:, 2], 2.0)) - target.bottom if target.kind else _top(points) - top
+            if risen >= rise and beside <= _OVER:
                 found.append(points)
     clouds, points = sighting.clouds[-1:], np.concatenate(found)
     points = points[np.linalg.norm(points - middle, axis=1) < _REACH]
-    off, _ = KDTree(np.concatenate([object_points(clouds), points_around(clouds)])).query(points)
-    return points[off > _STOOD]
+    own = np.empty((0, 3)) if target.kind else object_points(clouds)
+    return points[_away(points, np.concatenate([own, points_around(clouds)])) > _STOOD]
 
 
 def lifted(frames: Sequence[Frame], sighting: Sighting, risen: Array, T_now_before: Array, grip: Array) -> Sighting:

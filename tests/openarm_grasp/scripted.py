@@ -124,6 +124,8 @@ class World(Skills):
         carried, effort: What the planner carries by arm; force of the fingers that hold nothing known, N.
         scene, q: Version of the planning scene, joints.
         near_off: How far off the camera on the hand sees objects, m.
+        place_error: How far off its place an object comes to stand, m.
+        lands: How an object that is put down comes to stand, of how it should.
         followed: Trajectories, in their order.
         lines: (3,) of pushes that were planned, m.
         far: The arms grasp nothing that is further away than this, m; a hand may push it from there.
@@ -146,6 +148,7 @@ class World(Skills):
         self.far, self.follows, self.hands_come_behind, self.pushed = 1.0, 1.0, True, 0
         self.two_sided = False
         self.scene, self.q, self.near_off = 1, {"right_joint1": 0.0, "left_joint1": 0.0}, 0.0
+        self.lands: Callable[[Detection], Detection] = lambda stands: stands
         self.followed: list[object] = []
         self.lines: list[np.ndarray] = []
         self.stopped: Code | None = None
@@ -157,7 +160,8 @@ class World(Skills):
         self.session = GraspSession(GraspContext(self._config, robot_work().table, HAND, shoulders, looks))
         self.deadline_ns, self.velocity_scale = 0, 0.0
         self.robot = self  # type: ignore[assignment]
-        self._target, self._label, self._line = np.zeros(3), "", np.zeros(3)
+        self._target, self._turn, self._label, self._line = np.zeros(3), 0.0, "", np.zeros(3)
+        self._object: Detection | None = None
 
     # --- running
     def grasp(self, label: str = "red", **kwargs: Any) -> GraspOutcome:
@@ -280,7 +284,7 @@ class World(Skills):
         within = [i for i, way in enumerate(request.targets) if self.reaches(request.arm, way.position)]
         if not within:
             self._reach(request.arm, request.targets[0].position)
-        self._target = request.targets[within[0]].position
+        self._target, self._turn = request.targets[within[0]].position, request.targets[within[0]].yaw_offset
         return self._planned(within[0], "carry", "put down", "leave")
 
     def _planned(self, chosen: int, *names: str) -> Planned:
@@ -378,14 +382,15 @@ class World(Skills):
     # --- the world
     def move_gripper(self, position: float) -> None:
         if position > 0.0:
-            if self.held:
-                x, y, _ = self._target
-                self.objects[self.held] = standing(self.held, x + self.place_error, y)
+            if self.held and self._object:
+                stands = standing_at(self._object, self._target[:2] + np.array([self.place_error, 0.0]), self._turn)
+                self.objects[self.held] = self.lands(stands)
             self.held, self.gap = None, 2.0 * position
         elif self.slips or self._label not in self.objects:
             self.slips, self.gap = max(0, self.slips - 1), 0.0
         else:
-            self.held, self.gap = self._label, float(self.objects[self._label].size[0])
+            self.held, self._object = self._label, self.objects[self._label]
+            self.gap = float(self._object.size[0])
 
     def push(self) -> None:
         self.pushed += 1

@@ -159,7 +159,7 @@ def test_dry_run_plans_both_and_moves_nothing(world):
 # --- seeing
 @pytest.mark.requirement("B-58")
 def test_an_unknown_object_is_refused_with_what_is_in_view(world):
-    assert world.ends(Code.UNKNOWN_OBJECT, label="mug").message == "no 'mug' in view; in view: blue, red"
+    assert world.ends(Code.UNKNOWN_OBJECT, label="mug").message == "no 'mug' in view; in view: blue (box), red (box)"
     assert world.states.count(State.DETECT) == 3
     assert State.TRANSFORM not in world.states
 

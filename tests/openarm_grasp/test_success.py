@@ -67,5 +67,5 @@ def test_the_answers_of_a_pick_and_of_a_place_carry_their_proof(world):
     assert picked.proof.camera.reason == "it has gone from its place"
     placed = world.grasp("", phase="place")
     assert isinstance(placed.proof, Proof)
-    assert placed.proof.camera.reason == "its middle is seen 0 mm from its target"
+    assert placed.proof.camera.reason == "its middle is seen 1 mm from its target"
     assert placed.proof.hand.ok
