@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,15 @@ class LabelledCloud:
         labels: (n,) uint32: i is the i-th detection of the same image, counted from 1; 0 is none of them: the table, or
             what was not detected.
         camera: (3,) where the image was taken from, in the frame of the points.
+        measured: Whether depth has measured them; else they are those of boxes, on which no surface is known.
     """
 
     points: Floats
     labels: NDArray[np.uint32]
     camera: Array
+    measured: bool = True
 
     def moved(self, T: Array) -> LabelledCloud:
         """Return the same in another frame: T (4, 4) is the pose of this one in it."""
         points = self.points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
-        return LabelledCloud(points, self.labels, se3.apply(T, self.camera))
+        return replace(self, points=points, camera=se3.apply(T, self.camera))

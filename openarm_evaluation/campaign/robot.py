@@ -350,9 +350,9 @@ class SimRobot:
         self._objects[name] = objects
         if deep:
             return Frame(stamp_ns, perceived.boxes, cloud.moved(T_base_camera))
-        frame, joints = Frame(stamp_ns, perceived.boxes), self.states.joints_at(min(stamp_ns, self.states.latest()[0]))
-        outline = self._silhouette.outline(optics, T_base_camera, self._silhouette.shapes(joints, self.held))
-        return with_points(frame, optics, T_base_camera, self.table.top_z, outline)
+        shapes = self._silhouette.shapes(self.states.latest()[1], self.held)
+        outline = self._silhouette.outline(optics, T_base_camera, shapes)
+        return with_points(Frame(stamp_ns, perceived.boxes), optics, T_base_camera, self.table.top_z, outline)
 
     def _carriers(self, stamp_ns: int) -> Mapping[str, Carrier] | None:
         """What the hands hold at the stamp of an image; None when their posture is not known."""

@@ -69,7 +69,7 @@ def points_of(
     if robot is not None:
         kept &= ~robot
     points = camera + depth[kept, None] * rays[kept]
-    return LabelledCloud(points.astype(np.float32), labels[kept], camera)
+    return LabelledCloud(points.astype(np.float32), labels[kept], camera, measured=False)
 
 
 def _window(lens: Intrinsics, corners: Array) -> tuple[slice, slice]:

@@ -52,7 +52,7 @@ def offers(
 def asked(context: GraspContext, arm: str, sighting: Sighting, failed: Sequence[FailedGrasp] = ()) -> Sampling:
     """Return what a sampler is given; a surface where the points of the object are known. Arguments as `offers`."""
     config, surface = context.config_of(arm), None
-    if sighting.clouds:
+    if sighting.clouds and all(cloud.measured for cloud in sighting.clouds):
         floor = sighting.target.bottom
         surface = fuse(views_of(sighting.clouds, floor), floor, step=config.cloud.voxel)
     return Sampling(

@@ -302,7 +302,7 @@ class GraphClients:
             if mounted is None or self.sees(_points_of(self._topic)):
                 return frame
             T, lens = buffer.lookup(base, mounted.optical_frame, frame.t_ns), mounted.intrinsics
-            shapes = self._outline.shapes(buffer.joints_at(frame.t_ns), self.robot.tracker.held)
+            shapes = self._outline.shapes(buffer.latest()[1], self.robot.tracker.held)
             return with_points(frame, lens, T, self.table_z, self._outline.outline(lens, T, shapes))
         except OpenArmError as error:
             self._node.get_logger().warning(f"dropped the points of a frame: {error.message}")

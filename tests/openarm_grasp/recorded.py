@@ -57,7 +57,7 @@ def _with_points(robot: Any, seen: Frames, camera: str) -> Frames:
     for k, frame in enumerate(made):
         if frame.cloud is None:
             T = robot.states.lookup(robot.base_frame, mounted.parent, frame.t_ns) @ mounted.T_parent_optical
-            shapes = robot_filter.shapes(robot.states.joints_at(min(frame.t_ns, robot.states.latest()[0])))
+            shapes = robot_filter.shapes(robot.states.latest()[1])
             outline = robot_filter.outline(mounted.intrinsics, T, shapes)
             made[k] = with_points(frame, mounted.intrinsics, T, 0.4, outline)
     return replace(seen, frames=tuple(made))

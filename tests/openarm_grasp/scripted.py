@@ -162,6 +162,7 @@ class World(Skills):
         self.robot = self  # type: ignore[assignment]
         self._target, self._turn, self._label, self._line = np.zeros(3), 0.0, "", np.zeros(3)
         self._object: Detection | None = None
+        self._went = np.zeros(3)
 
     # --- running
     def grasp(self, label: str = "red", **kwargs: Any) -> GraspOutcome:
@@ -322,6 +323,7 @@ class World(Skills):
         self.pass_time(1.0)
         if trajectory == "lift" and self.held:
             self.lifted(self.held)
+        self._went = self._line if trajectory == "push" else np.zeros(3)
         if trajectory == "push":
             self.push()
 
@@ -377,7 +379,7 @@ class World(Skills):
         return self.carried.get(arm)
 
     def T_base_tcp(self, arm: str) -> np.ndarray:
-        return se3.make(p=(0.26, 0.2, 0.6))
+        return se3.make(p=np.array([0.26, 0.2, 0.6]) + self._went)
 
     # --- the world
     def move_gripper(self, position: float) -> None:

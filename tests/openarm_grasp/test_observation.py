@@ -16,7 +16,7 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.config import DetectConfig
-from openarm_grasp.perception.detections import Frame, Ids, average, find, in_base, on_table, sticks_out
+from openarm_grasp.perception.detections import Frame, Ids, average, find, in_base, on_table
 from openarm_grasp.perception.sightings import seen_at
 from tests.refusals import refused, refuses
 
@@ -217,19 +217,6 @@ def test_what_is_not_measured_is_in_the_way_but_no_target() -> None:
 def test_what_is_measured_in_one_frame_of_three_alone_cannot_be_measured() -> None:
     hidden = seen(x=0.27, score=0.0)
     assert refused("cannot be measured", look, frames((hidden,), (hidden,), (seen(),))).code is Code.NOTHING_DETECTED
-
-
-@pytest.mark.parametrize("yaw", [0.0, 0.6])
-def test_how_far_something_reaches_out_of_its_place(yaw) -> None:
-    stood = seen(yaw=yaw)
-    shift = se3.make(p=(*(se3.rot_z(yaw)[:2, 0] * 0.02), 0.0))
-    moved = Detection("red", 0.9, shift @ stood.T_base_object, stood.size)
-    assert sticks_out(stood, stood) == pytest.approx(0.0, abs=1e-12)
-    assert sticks_out(moved, stood) == pytest.approx(0.02)
-    # the corners of a box around something round are no part of it
-    assert sticks_out(seen(size=(0.04, 0.04, 0.05), yaw=0.8), seen(size=(0.04, 0.04, 0.05))) == pytest.approx(
-        0.0, abs=1e-12
-    )
 
 
 def cloud_of(*detections: Detection) -> LabelledCloud:
