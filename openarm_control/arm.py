@@ -95,6 +95,7 @@ class _Goal:
     path_tolerance: Array
     goal_tolerance: Array
     goal_time_s: float
+    lenient: bool  # it has a goal tolerance of its own: what is within it is not worked off
     offset: Array  # (k,) present command minus first point; fades
     blend_from_s: float
     blend_time_s: float
@@ -224,6 +225,7 @@ class TrajectoryFollower(Follower):
         tau = (t_ns - goal.start_ns) * 1e-9
         error = self._command.position - position
         names, config = self.group.names, self._config
+        arrived = np.all(np.abs(error) <= goal.goal_tolerance) and np.all(np.abs(velocity) <= config.stopped_velocity)
         if goal.cancelled and goal.rate <= 0.0:
             self._target = self._command.position.copy()
             self._finish(End.CANCELLED, TrajectoryResult.SUCCESSFUL, "cancelled; the arm holds")
@@ -237,9 +239,9 @@ class TrajectoryFollower(Follower):
                     f"{names[j]} is {abs(error[j]):.3f} rad off its path at {tau:.2f} s of {goal.spline.end_s:.2f},"
                     f" tolerance {goal.path_tolerance[j]:.3f}; the arm holds where it is. Is something blocking it?",
                 )
-        elif self._settles(goal, tau - goal.spline.end_s, error, dt):
+        elif self._settles(goal, tau - goal.spline.end_s, error, dt, near_enough=goal.lenient and bool(arrived)):
             pass
-        elif np.all(np.abs(error) <= goal.goal_tolerance) and np.all(np.abs(velocity) <= config.stopped_velocity):
+        elif arrived:
             self._finish(End.SUCCEEDED, TrajectoryResult.SUCCESSFUL, "goal reached")
         elif tau > goal.spline.end_s + goal.goal_time_s:
             j = int(np.argmax(np.abs(error) - goal.goal_tolerance))
@@ -251,12 +253,13 @@ class TrajectoryFollower(Follower):
                 f" {config.stopped_velocity:.3f} rad/s",
             )
 
-    def _settles(self, goal: _Goal, over_s: float, error: Array, dt: float) -> bool:
+    def _settles(self, goal: _Goal, over_s: float, error: Array, dt: float, *, near_enough: bool) -> bool:
         """Let the carrier work off what is left at the end of a motion; whether it still does."""
         config = self._carrier.config
         if not self._carrier.settles or goal.settled:
             return False
-        goal.settled = over_s > config.settle_time or self._carrier.settled(self._command.position, error)
+        timely = over_s <= config.settle_time and not near_enough
+        goal.settled = not timely or self._carrier.settled(self._command.position, error)
         if goal.settled:
             self._carrier.weigh(self._command.position, error)
         else:
@@ -322,6 +325,7 @@ class TrajectoryFollower(Follower):
             path_tolerance=path,
             goal_tolerance=self._tolerances(trajectory.goal_tolerance, self._config.goal_tolerance),
             goal_time_s=_or_default(trajectory.goal_time_s, self._config.goal_time),
+            lenient=any(tolerance > 0.0 for tolerance in trajectory.goal_tolerance.values()),
             offset=offset,
             blend_from_s=elapsed,
             blend_time_s=max(1e-3, min(self._config.blend_time, float(t[-1] - elapsed))),

@@ -445,10 +445,11 @@ class _ArmController:
     def ready(self) -> bool:
         return True
 
-    def start(self, motion: Motion, begin_ns: int) -> _Goal:
+    def start(self, motion: Motion, begin_ns: int, *, touches: bool) -> _Goal:
         robot, goal = self._robot, _Goal(self._follower, begin_ns or self._robot.t_ns)
         measured = robot.world.read_joints().position[robot.columns(motion.names)]
-        points = FollowedTrajectory(motion.names, motion.t, motion.q, motion.v, motion.a, begin_ns)
+        near = {} if touches else dict.fromkeys(motion.names, robot.suite.motion.execution.goal_tolerance)
+        points = FollowedTrajectory(motion.names, motion.t, motion.q, motion.v, motion.a, begin_ns, goal_tolerance=near)
         try:
             self._follower.start(self._follower.check(points), robot.t_ns, measured, goal.end)
         except TrajectoryError as error:

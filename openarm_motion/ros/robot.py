@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 
 from action_msgs.msg import GoalInfo
 from control_msgs.action import FollowJointTrajectory
+from control_msgs.msg import JointTolerance
+from rclpy.duration import Duration
 from rclpy.task import Future, Task
 from std_msgs.msg import Float64
 from unique_identifier_msgs.msg import UUID
@@ -24,7 +26,7 @@ from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_to_m
 from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
-from openarm_motion.config import MotionConfig
+from openarm_motion.config import ExecutionConfig, MotionConfig
 from openarm_motion.service.robot import Outcome
 from openarm_motion.timing.trajectory import Motion
 
@@ -54,7 +56,7 @@ class NodeRobot:
         self._node = node
         self.listener = RobotStateListener(node, node.description)
         self._controllers = {
-            arm: Controller(node, config.controller.format(arm=arm), partial(holds.goal_id, arm))
+            arm: Controller(node, config.controller.format(arm=arm), config.execution, partial(holds.goal_id, arm))
             for arm in (*(config.arms or node.description.arm_names), *([LIFT] if node.description.lift else []))
         }
         self._waiting, self._wake = 0, Future(executor=node.executor)
@@ -115,12 +117,13 @@ class Controller:
     Args:
         node: Owns the client.
         name: Name of the action.
+        execution: Parameters.
         goal_id: Makes the id of a goal.
     """
 
-    def __init__(self, node: BaseNode[Any], name: str, goal_id: Callable[[], UUID]) -> None:
+    def __init__(self, node: BaseNode[Any], name: str, execution: ExecutionConfig, goal_id: Callable[[], UUID]) -> None:
         self.name = name
-        self._goal_id = goal_id
+        self._execution, self._goal_id = execution, goal_id
         self._client = ActionClient(node, FollowJointTrajectory, name)
         self._owner = node.create_publisher(GoalInfo, owner_topic(name), latest())
         #: See `ArmController.fastest`.
@@ -134,7 +137,7 @@ class Controller:
         """Whether its action is in the graph."""
         return self._client.server_is_ready()
 
-    def start(self, motion: Motion, begin_ns: int) -> _Goal:
+    def start(self, motion: Motion, begin_ns: int, *, touches: bool) -> _Goal:
         """Send a trajectory; its stamp is where it begins. The arm holds when this process dies or hangs."""
         message = trajectory_to_msg(motion.names, motion.t, motion.q, motion.v, motion.a)
         message.header.stamp = ns_to_stamp(begin_ns)
@@ -142,6 +145,10 @@ class Controller:
         lifeline = Lifeline(bytes(info.goal_id.uuid).hex())
         self._owner.publish(info)
         goal = FollowJointTrajectory.Goal(trajectory=message)
+        if not touches:
+            near = self._execution.goal_tolerance
+            goal.goal_tolerance = [JointTolerance(name=name, position=near) for name in motion.names]
+            goal.goal_time_tolerance = Duration(seconds=self._execution.settle).to_msg()
         sent = _Goal(lifeline)
         answer = self._client.send_goal_async(goal, feedback_callback=sent.on_feedback, goal_uuid=info.goal_id)
         answer.add_done_callback(sent.on_answer)

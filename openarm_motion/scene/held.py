@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each arm holds, as far as plans say so: a plan says what will be held on each of its parts."""
+"""What each arm holds, as far as plans say so: a plan says what is held on each of its parts, and where it touches."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -18,12 +19,20 @@ from openarm_motion.timing.trajectory import Motion, Trajectory
 _PLANS = 32
 
 
+@dataclass(frozen=True, eq=False)
+class PlannedPart:
+    """What a plan says of one of its parts: what the arm holds on it, and whether it touches something at its end."""
+
+    held: tuple[Box, ...]
+    touches: bool
+
+
 class HeldObjects:
     """What the hands hold, and what they will hold when a plan is executed."""
 
     def __init__(self) -> None:
         self._held: dict[str, tuple[Box, ...]] = {}
-        self._expected: OrderedDict[tuple[str, bytes], tuple[Box, ...]] = OrderedDict()
+        self._expected: OrderedDict[tuple[str, bytes], PlannedPart] = OrderedDict()
 
     @property
     def held(self) -> Mapping[str, tuple[Box, ...]]:
@@ -57,15 +66,14 @@ class HeldObjects:
         before, self._held[arm] = self._held.get(arm, ()), tuple(boxes)
         return not _same(before, self._held[arm])
 
-    def expect(self, arm: str, trajectories: Sequence[Trajectory], boxes: Sequence[Box]) -> None:
-        """Note what the arm will hold when it executes one of the trajectories."""
-        for trajectory in trajectories:
-            self._expected[arm, _key(trajectory.q)] = tuple(boxes)
+    def expect(self, arm: str, trajectory: Trajectory, boxes: Sequence[Box], *, touches: bool = False) -> None:
+        """Note what the arm will hold when it executes a trajectory, and whether it touches something at its end."""
+        self._expected[arm, _key(trajectory.q)] = PlannedPart(tuple(boxes), touches)
         while len(self._expected) > _PLANS:
             self._expected.popitem(last=False)
 
-    def expected(self, arm: str, motion: Motion) -> tuple[Box, ...] | None:
-        """What the arm holds on a motion; None for one that was not planned here."""
+    def expected(self, arm: str, motion: Motion) -> PlannedPart | None:
+        """What was planned of a motion; None for one that was not planned here."""
         return self._expected.get((arm, _key(motion.q)))
 
 

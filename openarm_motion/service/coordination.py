@@ -81,7 +81,8 @@ class ArmCoordination:
         self._starting = True
         try:
             motion = check_trajectory(arm, given, self._robot.states.latest()[1])
-            held = self._held.expected(arm.name, motion)
+            planned = self._held.expected(arm.name, motion)
+            held = None if planned is None else planned.held
             begin_ns, delay = await self._begin(arm, motion, held, cancelled, max_delay)
             if held is not None:
                 self.hold(arm.name, held)
@@ -90,7 +91,8 @@ class ArmCoordination:
         finally:
             self._starting = False
         try:
-            await self.followers[arm.name].follow(motion, begin_ns, halt, progress)
+            touches = planned is None or planned.touches
+            await self.followers[arm.name].follow(motion, begin_ns, halt, progress, touches=touches)
         except OpenArmError as error:
             self.stops[arm.name] += 1
             if halt.fault is not None:

@@ -48,6 +48,7 @@ class _Execution:
 
     motion: Motion
     begin_ns: int
+    touches: bool
     cancelled: Callable[[], bool]
     progress: Callable[[float], None]
     watch: Watch
@@ -72,7 +73,13 @@ class TrajectoryFollower:
         self.active = MotionInProgress(motion, begin_ns or self._robot.states.latest()[0], bool(begin_ns))
 
     async def follow(
-        self, motion: Motion, begin_ns: int, cancelled: Callable[[], bool], progress: Callable[[float], None]
+        self,
+        motion: Motion,
+        begin_ns: int,
+        cancelled: Callable[[], bool],
+        progress: Callable[[float], None],
+        *,
+        touches: bool = True,
     ) -> None:
         """Send a trajectory and return when the arm has arrived.
 
@@ -81,12 +88,13 @@ class TrajectoryFollower:
             begin_ns: Robot time of its beginning; 0: at once.
             cancelled: Whether to stop; the controller then holds.
             progress: Called with 0 to 1 while the arm moves.
+            touches: Something is touched where it ends; see `ArmController.start`.
 
         Raises:
             OpenArmError: NOT_READY, without controller or joint states; ROBOT_LOST, when either vanishes on the way;
                 EXECUTION_FAILED, with the controller's reason or the joint that did not arrive; TIMEOUT; CANCELLED.
         """
-        run = _Execution(motion, begin_ns, cancelled, progress, Watch(self._robot))
+        run = _Execution(motion, begin_ns, touches, cancelled, progress, Watch(self._robot))
         self.begin(motion, begin_ns)
         try:
             await run.watch.fresh()
@@ -100,7 +108,7 @@ class TrajectoryFollower:
         progress(1.0)
 
     async def _send(self, run: _Execution) -> None:
-        name, goal = self._controller.name, self._controller.start(run.motion, run.begin_ns)
+        name, goal = self._controller.name, self._controller.start(run.motion, run.begin_ns, touches=run.touches)
         try:
             if not await run.watch.until(lambda: goal.accepted is not None, lambda: self._check(run), _ANSWER):
                 raise OpenArmError(Code.ROBOT_LOST, f"{name} did not answer a goal within {_ANSWER:g} s")

@@ -90,7 +90,7 @@ class LiftMotions:
         controller = self._robot.controller(LIFT)
         if not controller.ready():
             raise OpenArmError(Code.NOT_READY, f"{controller.name} is not there")
-        watch, goal = Watch(self._robot), controller.start(plan, 0)
+        watch, goal = Watch(self._robot), controller.start(plan, 0, touches=True)
 
         def check() -> None:
             if watch.silence > self._stale_after:

@@ -77,8 +77,15 @@ class ArmController(Protocol):
         """Whether it is there."""
         ...
 
-    def start(self, motion: Motion, begin_ns: int) -> TrajectoryGoal:
-        """Send a trajectory that begins at a robot time, or at once when that is 0."""
+    def start(self, motion: Motion, begin_ns: int, *, touches: bool) -> TrajectoryGoal:
+        """Send a trajectory.
+
+        Args:
+            motion: The trajectory.
+            begin_ns: Robot time of its beginning; 0: at once.
+            touches: Something is touched where it ends: the controller brings the joints as near as it can. Else they
+                have arrived within the goal tolerance of `ExecutionConfig`.
+        """
         ...
 
 

@@ -39,12 +39,12 @@ class Bench:
         for _ in range(n):
             self.robot.tick()
 
-    def go(self, offset: float) -> TrajectoryOutcome:
+    def go(self, offset: float, near: float = -1.0) -> TrajectoryOutcome:
         q = self.follower.state.desired if self.follower.state else self.robot.state.position[ARM]
         points = np.stack([q, q + offset * np.array([0.3, 0.4, -0.3, 0.5, 0.3, 0.2, -0.3])])
-        loose = dict.fromkeys(self.follower.group.names, -1.0)
+        loose, goal = (dict.fromkeys(self.follower.group.names, x) for x in (-1.0, near))
         goal = Trajectory(
-            self.follower.group.names, np.array([0.0, 0.8]), points, np.zeros((2, 7)), np.zeros((2, 7)), 0, loose, loose
+            self.follower.group.names, np.array([0.0, 0.8]), points, np.zeros((2, 7)), np.zeros((2, 7)), 0, loose, goal
         )
         ends: list[TrajectoryOutcome] = []
         self.follower.start(self.follower.check(goal), self.robot.world.t_ns, q, ends.append)
@@ -155,6 +155,28 @@ def test_what_presses_on_a_surface_is_not_pressed_harder_and_harder() -> None:
     before = bench.robot.targets[ARM].copy()
     bench.tick(200)
     assert np.abs(bench.robot.targets[ARM] - before).max() < 0.02
+
+
+def test_what_is_left_within_a_tolerance_of_the_goal_is_not_worked_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The motion ends sooner then, as near as the goal asks, and what the hand holds is weighed all the same."""
+    held = property(lambda _: True, lambda _, value: None)
+    monkeypatch.setattr(GripperFollower, "pressing", held, raising=False)
+    took: list[float] = []
+    for near in (0.0, 0.02):
+        bench = Bench(CarrierConfig(), HardwareConfig().of_seed(15))
+        bench.tick(50)
+        model = bench.robot.world.model
+        model.body_mass[model.body(bench.description.tcp_link("right")).id] += 0.35
+        begin_ns = bench.robot.world.t_ns
+        assert bench.go(1.0, near).result is TrajectoryResult.SUCCESSFUL
+        took.append((bench.robot.world.t_ns - begin_ns) * 1e-9)
+        assert bench.follower.carrier.payload == pytest.approx(0.45, abs=0.15)
+        assert bench.follower.state is not None
+        assert np.abs(bench.follower.state.desired - bench.follower.state.actual).max() <= 0.02
+        bench.go(-1.0)
+        assert bench.error() < 0.005
+    assert took[1] < 0.9
+    assert took[0] > took[1] + 0.2
 
 
 def test_gains_fall_with_the_latency_and_with_the_inertia() -> None:

@@ -106,9 +106,11 @@ def test_motions_that_begin_together_are_checked_at_the_same_moments(
 def test_what_is_held_follows_the_plan(plan: Trajectory) -> None:
     memory = HeldObjects()
     box = Box("cube", np.eye(4), np.array([0.05, 0.05, 0.05]))
-    memory.expect("right", [plan], [box])
+    memory.expect("right", plan, [box])
     motion = Motion(plan.names, plan.t, plan.q)
-    assert memory.expected("right", motion) == (box,)
+    expected = memory.expected("right", motion)
+    assert expected is not None
+    assert expected.held == (box,)
     assert memory.expected("left", motion) is None
     assert memory.expected("right", Motion(plan.names, plan.t, plan.q[::-1])) is None
     assert memory.hold("right", [box])

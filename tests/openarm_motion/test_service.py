@@ -64,13 +64,15 @@ class Controller:
     def __init__(self, robot: Robot, name: str) -> None:
         self.robot, self.name = robot, name
         self.goals: list[Goal] = []
+        self.touches: list[bool] = []
         self.there = True
         self.fastest = math.inf
 
     def ready(self) -> bool:
         return self.there
 
-    def start(self, motion: Motion, begin_ns: int) -> Goal:
+    def start(self, motion: Motion, begin_ns: int, *, touches: bool) -> Goal:
+        self.touches.append(touches)
         self.goals.append(Goal(self.robot, motion, begin_ns or self.robot.t_ns + self.robot.latency_ns))
         return self.goals[-1]
 
@@ -384,6 +386,7 @@ def test_what_a_controller_executes_begins_and_ends_with_zero_velocity_and_accel
     ):
         (answer,) = bench.run(request)
         assert answer.code is Code.OK, answer.message
+    assert robot.controllers["right"].touches[:4] == [False, True, False, True], "the approach, and what is no plan's"
     executed = [(side, goal.motion) for side in arms for goal in robot.controllers[side].goals]
     assert len(executed) >= 7
     for side, motion in executed:
