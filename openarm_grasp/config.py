@@ -11,6 +11,9 @@ from openarm_common.camera.cameras import table_camera
 from openarm_common.config import Config, Interval
 from openarm_common.robot.folder import robot_hand, robot_work
 
+#: Slowest motions, as a share of the limits of the joints.
+LEAST_SCALE = 0.001
+
 
 class ApproachConfig(Config):
     """Where the hand stands before, at and after the grasp."""
@@ -346,7 +349,7 @@ class GraspConfig(Config):
         default_factory=table_camera, description="that the detections come from; named by the drift alarm"
     )
     velocity_scale: float = Field(
-        default=1.0, ge=0.001, le=1.0, description="share of the limits of the joints, where a request has none"
+        default=1.0, ge=LEAST_SCALE, le=1.0, description="share of the limits of the joints, where a request has none"
     )
     sampler: str = Field(
         default="auto",

@@ -17,7 +17,7 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import Box as GraspBox
 from openarm_grasp.planning.options import NoWayError
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, check_deadline
+from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, check_deadline, slowed
 from openarm_grasp.robot.interface import Trajectory as AnyTrajectory
 from openarm_motion.collision.solids import Box
 from openarm_motion.planning.approach import ApproachRequest, Target
@@ -164,7 +164,7 @@ class InProcessRobot:
             request.arm,
             approach_of(request),
             start,
-            self.velocity_scale * request.velocity_scale,
+            slowed(self.velocity_scale, request.velocity_scale),
             boxes_of(request.ignore_regions),
         )
         answer = await self._asked(lambda stopped: self.robot.motion.plan_approach(asked, stopped))
@@ -277,4 +277,5 @@ def approach_of(request: PlanGrasp | PlanPlace) -> ApproachRequest:
             frozenset(box.id for box in request.target),
         )
         return ApproachRequest(targets, obstacles, touchable=touchable, attached_after=True)
-    return ApproachRequest(targets, boxes_of(request.obstacles), boxes_of(request.held), detached_after=True)
+    held = boxes_of(request.held)
+    return ApproachRequest(targets, boxes_of(request.obstacles), held, detached_after=True, blend=True)

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from openarm_grasp.robot.interface import Planned, Trajectory
     from openarm_grasp.robot.skills import Skills
 
-#: Names of the parts of a plan, as they are shown.
+#: Names of the parts of a plan, as they are shown; a carry goes on to the place, and no approach is left.
 GRASP = ("transfer", "approach", "lift")
-PLACE = ("carry", "put down", "leave")
+PLACE = ("carry", "", "leave")
 PUSH = ("move behind", "move down", "push")
 
 
@@ -110,7 +110,8 @@ async def agree(
     if not task.request.confirm or task.request.dry_run:
         return ""
     robot = task.robot
-    parts = tuple(part for names, p in plans for part in zip(names, (p.transfer, p.approach, p.retreat), strict=True))
+    every = (part for names, p in plans for part in zip(names, (p.transfer, p.approach, p.retreat), strict=True))
+    parts = tuple((name, trajectory) for name, trajectory in every if name)
     shown = ShownPlan(f"p{token_hex(3)}", arm, parts)  # a letter first: YAML takes it for a string
     text = f"{text}; {sum(plan.duration for _, plan in plans):.1f} s of motion"
     before = {**robot.joints(), **plans[0][1].start}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import LONGEST_TEXT, brief, check_length
-from openarm_grasp.config import DetectConfig
+from openarm_grasp.config import LEAST_SCALE, DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict
 from openarm_grasp.perception.detections import Frame, Sighting, Spot, find
 from openarm_grasp.planning.arms import check_arm
@@ -21,8 +21,6 @@ from openarm_grasp.requests.state_times import StateTime
 if TYPE_CHECKING:
     from openarm_grasp.planning.options import Option
 
-#: Slowest motions, as a share of the limits of the joints.
-LEAST_SCALE = 0.001
 #: What to pick, and what to put it on or in.
 _ON = re.compile(r"(.*?)\s*\b(?:on|in):\s*(\S.*)", re.DOTALL)
 #: What a request may ask for.

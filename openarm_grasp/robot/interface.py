@@ -15,6 +15,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.types import Array
+from openarm_grasp.config import LEAST_SCALE
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget
@@ -76,8 +77,8 @@ class Planned:
 
     Attributes:
         chosen: Index of the way.
-        transfer: Free path to the beginning of the approach.
-        approach: Straight line to where it grasps or lets go.
+        transfer: Free path to the beginning of the approach; of a place, it goes on to where it lets go.
+        approach: Straight line to where it grasps; of a place, a rest where it lets go.
         retreat: Straight line away.
         refusals: Why others were refused, by id.
         limit_margins: Of each way, how near it comes to a joint limit, rad; NaN: refused or not evaluated. Empty when
@@ -191,6 +192,11 @@ class RobotInterface(Protocol):
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Move the fingers with at most `effort` N (0: any); whether they arrived or push against something."""
         ...
+
+
+def slowed(scale: float, share: float) -> float:
+    """A share of a velocity scale, no less than what the planner accepts."""
+    return max(scale * share, LEAST_SCALE)
 
 
 def check_deadline(now_ns: int, deadline_ns: int) -> None:

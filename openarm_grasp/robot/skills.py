@@ -34,7 +34,7 @@ from openarm_grasp.planning.candidates import (
 )
 from openarm_grasp.planning.neighbours import neighbours, under
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
+from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory, slowed
 
 #: The map shows an object so much wider than it is, m.
 _CELL = 0.01
@@ -88,7 +88,7 @@ class Skills:
             scale: The share; 0: that of the configuration.
             failures: Attempts that have failed.
         """
-        self.robot.velocity_scale = (scale or self._config.velocity_scale) * 0.5**failures
+        self.robot.velocity_scale = slowed(scale or self._config.velocity_scale, 0.5**failures)
 
     def warn(self, text: str) -> None:
         """Report something that does not stop the work."""
@@ -137,20 +137,23 @@ class Skills:
         self.stop_observing()
         return self.in_base(seen)
 
-    async def observe_towards_end(
-        self, motion: Callable[[], Awaitable[None]], near_end: Callable[[], bool], count: int
-    ) -> tuple[Frame, ...]:
-        """Carry out a motion, and observe from near its end on, while the arm comes to rest.
+    async def towards_end(
+        self,
+        motion: Callable[[], Awaitable[None]],
+        near_end: Callable[[], bool],
+        work: Callable[[], Awaitable[None]],
+    ) -> None:
+        """Carry out a motion, and something else from near its end on, unless it fails before.
 
         Args:
             motion: Motion of the arm.
             near_end: Whether it is near enough to its end.
-            count: Number of frames of the camera over the table.
+            work: Done then.
 
         Raises:
-            OpenArmError: As the motion, then as `observe`.
+            OpenArmError: As the motion, then as the work.
         """
-        ended, frames = list[bool](), list[Frame]()
+        ended = list[bool]()
 
         async def move() -> None:
             try:
@@ -160,12 +163,23 @@ class Skills:
                 raise
             ended.append(True)
 
-        async def look() -> None:
+        async def then() -> None:
             await self.robot.until(lambda: bool(ended) or near_end(), self._config.limits.move_timeout, "the motion")
             if ended != [False]:
-                frames.extend((await self.observe(count)).frames)
+                await work()
 
-        await self.robot.together([move, look])
+        await self.robot.together([move, then])
+
+    async def observe_towards_end(
+        self, motion: Callable[[], Awaitable[None]], near_end: Callable[[], bool], count: int
+    ) -> tuple[Frame, ...]:
+        """As `towards_end`, the work being so many frames of the camera over the table; errors also as `observe`."""
+        frames = list[Frame]()
+
+        async def look() -> None:
+            frames.extend((await self.observe(count)).frames)
+
+        await self.towards_end(motion, near_end, look)
         return tuple(frames)
 
     # --- planning
@@ -279,6 +293,7 @@ class Skills:
         *,
         carrying: bool = False,
         line: tuple[Array, Array] | None = None,
+        check: Callable[[], None] = lambda: None,
     ) -> None:
         """Follow a planned trajectory.
 
@@ -289,14 +304,17 @@ class Skills:
             carrying: A hand that closes or slips stops it.
             line: Ends (3,) of the straight line that the TCP follows, base frame, m; leaving it by more than
                 `path_tolerance` stops it.
+            check: Called on the way; what it raises stops the arm.
 
         Raises:
-            OpenArmError: GRASP_LOST; HAND_COLLISION; as the robot.
+            OpenArmError: GRASP_LOST; HAND_COLLISION; as the robot; as `check`.
         """
         self.robot.check()
         held, at_first, tolerance = self._config.held, self.aperture(arm), self._config.approach.path_tolerance
 
         def still_held() -> None:
+            if not carrying:
+                return
             now = self.aperture(arm)
             if self.is_closed(arm):
                 raise OpenArmError(Code.GRASP_LOST, f"{what}: the hand closed to {now * 1e3:.1f} mm on the way")
@@ -313,7 +331,11 @@ class Skills:
                 text = f"{what}: the hand is {off * 1e3:.0f} mm off its straight line, expected at most"
                 raise OpenArmError(Code.HAND_COLLISION, f"{text} {tolerance * 1e3:.0f} mm; is something in its way?")
 
-        guard = still_held if carrying else None if line is None else on_line
+        def guard() -> None:
+            still_held()
+            on_line()
+            check()
+
         await self.robot.follow(arm, trajectory, f"{arm} arm: {what}", guard)
 
     async def follow_and_grip(

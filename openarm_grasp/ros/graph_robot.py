@@ -23,7 +23,7 @@ from openarm_common.ros.node import BaseNode
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import Box
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, Trajectory, check_deadline
+from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, Trajectory, check_deadline, slowed
 from openarm_grasp.ros import messages
 from openarm_grasp.ros.graph_clients import DETECTIONS, GraphClients
 
@@ -219,7 +219,7 @@ class GraphRobot:
     # --- planning and moving
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Ask /motion/plan_approach."""
-        goal = messages.plan_goal(request, self.velocity_scale * request.velocity_scale)
+        goal = messages.plan_goal(request, slowed(self.velocity_scale, request.velocity_scale))
         what = f"{request.arm} arm: planning"
         result = await self._nodes.goal(self._plan, goal, self._config.limits.plan_timeout, what, self._watched(None))
         return messages.planned_from_msg(result, len(goal.targets))

@@ -226,7 +226,8 @@ def plan_goal(request: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanAppr
         return goal
     goal.targets = _targets(request.targets)
     goal.obstacles = [box_to_msg(box) for box in request.obstacles]
-    goal.attached, goal.detached_after_approach = [box_to_msg(box) for box in request.held], True
+    goal.attached = [box_to_msg(box) for box in request.held]
+    goal.detached_after_approach = goal.blend_approach = True
     if request.after is not None:
         points = getattr(request.after, "points", None)
         if not points:

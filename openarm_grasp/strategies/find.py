@@ -356,7 +356,7 @@ def regrasped(run: Run, grasp: Grasp, sighting: Sighting) -> Grasp:
 
 
 async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> tuple[Planned, PlaceTarget]:
-    """Plan from where the arm is how to put the object down in one of these ways, unless that is confirmed already."""
+    """Plan from where the arm is how to put the object down in one of these ways, unless that is planned already."""
     run.enter(State.PLACE, why)
     run.robot.stop_observing()
     ready, run.place_plan = run.place_plan, None
@@ -364,7 +364,7 @@ async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why:
         why = await outdated(run.robot, (ready,), ready.start, run.config.confirm.joints)
         if not why:
             return ready, ways[ready.chosen]
-        run.enter(State.PLACE, f"the confirmed place has to be planned again: {why}")
+        run.enter(State.PLACE, f"the place has to be planned again: {why}")
     while True:
         plan = await run.robot.plan_place(
             grasp.arm, ways, grasp.sighting, grasp.candidate, turned=grasp.turned, in_part=grasp.in_part

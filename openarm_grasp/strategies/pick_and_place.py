@@ -261,7 +261,7 @@ async def close(run: Run, grasp: Grasp, why: str) -> tuple[Grasp, str]:
 
 
 async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, HandVerdict, CameraVerdict, str]:
-    """Lift straight up, then judge by gripper and camera whether the object has come along.
+    """Lift straight up and plan the place, then judge by gripper and camera whether the object has come along.
 
     Returns:
         The grasp, of all that has come along as one body; both verdicts, and the reason.
@@ -286,7 +286,18 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
                 raise
             robot.warn(f"lift: the {arm} arm gives way to the weight by {sag() * 1e3:.0f} mm")
 
-    frames = await robot.observe_towards_end(rise, lambda: sag() <= _ARRIVING, _LIFT_FRAMES)
+    async def plan_ahead() -> None:
+        # of what is no box or cylinder more is known after the lift; and a person confirms what is planned
+        if run.request.phase == "all" and not (grasp.of_cloud or run.request.confirm):
+            with suppress(OpenArmError):  # it is planned from where the arm then is
+                run.place_plan = await robot.plan_place(arm, grasp.places, sighting, grasp.candidate, plan.retreat)
+
+    async def watched() -> None:
+        seen.extend(await robot.observe_towards_end(rise, lambda: sag() <= _ARRIVING, _LIFT_FRAMES))
+
+    seen = list[Frame]()
+    await robot.robot.together([watched, plan_ahead])
+    frames = tuple(seen)
     evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
     gripper = grasp.judge(evidence, config.held, was_held=True)
     grasp, camera = judge_lifted(run, grasp, frames)
@@ -350,20 +361,14 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
         why: For the report.
         last: The hand keeps it when this fails: it is let go where it meets something on its way down, too.
     """
-    arm, robot, config = grasp.arm, run.robot, run.config
+    arm, robot = grasp.arm, run.robot
     plan, target = await plan_place(run, grasp, ways, why)
     if ways is grasp.places:
         run.place_target = target
     run.enter(State.PLACE, f"carrying to {target.id}")
     try:
-        await robot.follow(arm, plan.transfer, "carry", carrying=True)
-        evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
-        gripper = grasp.judge(evidence, config.held, was_held=True)
-        if not gripper.ok:
-            raise OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}")
-        run.enter(State.PLACE, gripper.reason)
-        failure = await _lower(run, grasp, plan, target, last=last)
-        await robot.open(arm, "release", grasp.candidate.opened, held=evidence.gap)
+        gripper, failure = await _carry(run, grasp, plan, target, last=last)
+        await robot.open(arm, "release", grasp.candidate.opened, held=robot.aperture(arm))
     except OpenArmError as error:
         if error.code is Code.GRASP_LOST:
             run.hand = Hand.FREE
@@ -384,25 +389,57 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
     return Placed(target, gripper, reason, failure)
 
 
-async def _lower(run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget, *, last: bool) -> Verdict | None:
-    """Go down to the place; what meets something a little above it is let go there, at the last try anywhere.
+async def _carry(
+    run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget, *, last: bool
+) -> tuple[GripperVerdict, Verdict | None]:
+    """Carry the object to its place and put it down; judge by the gripper as the hand comes to the line down.
+
+    What meets something a little above the place is let go there, at the last try anywhere.
 
     Returns:
-        Why it is not where it should be, when it was let go higher up; None, when it is.
+        That the hand holds it, and why it is not where it should be, when it was let go higher up; None, when it is.
 
     Raises:
-        OpenArmError: EXECUTION_FAILED, when it meets something higher up, and may be put back yet.
+        OpenArmError: GRASP_LOST, with the arm above the place; EXECUTION_FAILED, when it meets something on the way or
+            higher up, and may be put back yet.
     """
+    arm, robot, config = grasp.arm, run.robot, run.config
+    found, lost = list[GripperVerdict](), list[OpenArmError]()
+    line = float(np.linalg.norm(target.approach_offset))
+
+    def above() -> bool:
+        return float(np.linalg.norm((robot.T_base_tcp(arm) - target.T_base_tcp)[:3, 3])) <= line
+
+    async def judge() -> None:
+        evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
+        gripper = grasp.judge(evidence, config.held, was_held=True)
+        if not gripper.ok:
+            lost.append(OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}"))
+        run.enter(State.PLACE, gripper.reason)
+        found.append(gripper)
+
+    def check() -> None:
+        if lost:
+            raise lost[0]
+
+    async def carry() -> None:
+        await robot.follow(arm, plan.transfer, "carry", carrying=True, check=check)
+
+    failure = None
     try:
-        await run.robot.follow(grasp.arm, plan.approach, "put down", carrying=True)
+        await robot.towards_end(carry, above, judge)
     except OpenArmError as error:
-        if error.code is not Code.EXECUTION_FAILED:
+        if error.code is not Code.EXECUTION_FAILED or not above():
             raise
-        above = float((run.robot.T_base_tcp(grasp.arm) - target.T_base_tcp)[2, 3])
-        high = above > _MET_AT and not grasp.turned
+        height = float((robot.T_base_tcp(arm) - target.T_base_tcp)[2, 3])
+        high = height > _MET_AT and not grasp.turned
         if high and not last:
             raise
         text = f"{error.message}: what the hand holds meets something below, and is let go there"
-        run.robot.warn(text)
-        return run.fail(Code.PLACE_FAILED, f"{text}, {above * 1e3:.0f} mm above its place") if high else None
-    return None
+        robot.warn(text)
+        if high:
+            failure = run.fail(Code.PLACE_FAILED, f"{text}, {height * 1e3:.0f} mm above its place")
+        if not found:
+            await judge()
+    check()
+    return found[0], failure

@@ -118,8 +118,7 @@ async def _put_back(run: Run, grasp: Grasp) -> None:
                 way = replace(way, approach_offset=back)
             way = replace(way, T_base_tcp=T_back)
             plan = await robot.plan_place(arm, (way,), grasp.sighting, candidate, turned=slipped)
-            for part in (plan.transfer, plan.approach):
-                await robot.follow(arm, part, "put back")
+            await robot.follow(arm, plan.transfer, "put back")
     except OpenArmError as error:
         if error.code is not Code.EXECUTION_FAILED:
             raise

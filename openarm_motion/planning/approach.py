@@ -25,7 +25,8 @@ from openarm_motion.kinematics.chain import Solution
 from openarm_motion.kinematics.line import Line, line_contact, solve_line
 from openarm_motion.planning.arm import Arm, StartState, first_contact, segment_time
 from openarm_motion.planning.failure import PlanFailedError, Stage
-from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.planning.planner import PlannedPath
+from openarm_motion.timing.trajectory import Trajectory, joined, resting
 from openarm_motion.timing.validation import validate_trajectory
 
 
@@ -59,6 +60,7 @@ class ApproachRequest:
         touchable: Ids of obstacles that the fingers may touch on the straight parts.
         attached_after: The touchable obstacles are carried on the retreat (a grasp).
         detached_after: The held boxes are left behind on the retreat (a place).
+        blend: The free path goes on to the target without a stop before the straight line, where that is free.
     """
 
     targets: tuple[Target, ...]
@@ -67,6 +69,7 @@ class ApproachRequest:
     touchable: frozenset[str] = frozenset()
     attached_after: bool = False
     detached_after: bool = False
+    blend: bool = False
 
     def check(self) -> None:
         """Refuse a request that is none.
@@ -126,6 +129,9 @@ class Refused:
 _COMFORT = 0.3
 #: Targets checked for a start configuration before the search is tried.
 _GOALS = 24
+#: A line that a free path goes on to is followed in so many straight joint segments or more, none longer than this, m:
+#: a few tenths of a millimetre off it.
+_LEAST_SEGMENTS, _SEGMENT = 3, 0.03
 #: How far a target got, the furthest first.
 _CODES = (Code.NO_PLAN, Code.IN_COLLISION, Code.UNREACHABLE)
 _STAGES = ("certificate", "search", "line", "goal")
@@ -137,8 +143,8 @@ class ApproachPlan:
 
     Attributes:
         chosen: Index of the target.
-        transfer: Free path to the beginning of the approach.
-        approach: Straight line to the target.
+        transfer: Free path to the beginning of the approach; blended, it goes on to the target.
+        approach: Straight line to the target; blended, a rest there.
         retreat: Straight line away from it.
         refusals: Why others were not chosen.
         held_after: Boxes that the arm holds at the end, tool frame.
@@ -286,8 +292,8 @@ class _Checks:
             self._arrange(pose)
             # the transfer may end whole turns away from where the lines were solved
             whole = nearest_turns(best.approach.q[0], free.trajectory.q[-1], arm.upper) - best.approach.q[0]
-            lines = (replace(line, q=line.q + whole) for line in (best.approach, best.retreat))
-            approach, retreat = (arm.time_line(line, now.scale) for line in lines)
+            line, away = (replace(line, q=line.q + whole) for line in (best.approach, best.retreat))
+            approach, retreat = (arm.time_line(one, now.scale) for one in (line, away))
             what = "approach"
             try:
                 validate_trajectory(self._approach, approach)
@@ -300,8 +306,35 @@ class _Checks:
             held = self.held_after(pose)
             self._margins[best.target] = best.margin
             margins = tuple(self._margins.tolist())
-            return ApproachPlan(best.target, free.trajectory, approach, retreat, tuple(refusals), held, margins)
+            transfer = free.trajectory
+            if self._request.blend:
+                transfer = self._blended(free.path, line, joined(transfer, approach))
+                approach = resting(arm.names, approach.q[-1], arm.config.planning.period)
+            return ApproachPlan(best.target, transfer, approach, retreat, tuple(refusals), held, margins)
         return None
+
+    def _blended(self, path: PlannedPath, line: Line, stopping: Trajectory) -> Trajectory:
+        """A free path and a line without a stop between them, where that is free and faster than the one that stops.
+
+        The line is followed in straight joint segments; the corner before it takes no more of it than the first one.
+        """
+        arm, before = self._arm, len(path.waypoints)
+        count = max(_LEAST_SEGMENTS, int(np.ceil(line.s[-1] / _SEGMENT)))
+        at = np.linspace(0, len(line.q) - 1, count + 1).round().astype(int)[1:]
+        timing, left = arm.timing_into(path, line.q[at], line.s[at], self._now.scale), True
+        while left:
+            found = timing.trajectory()
+            if found.duration >= stopping.duration:
+                break
+            found, k = found.of(arm.names), int(np.searchsorted(found.t, timing.moments[before - 1]))
+            try:
+                validate_trajectory(self.free, found.between(0, k))
+                validate_trajectory(self._approach, found.between(k, len(found.t) - 1))
+            except PlanFailedError as error:
+                left = timing.round_less(error.at)
+            else:
+                return found
+        return stopping
 
     def candidates(self, index: int) -> tuple[list[_Candidate], Refused | None]:
         """The best configurations for a target, or why there is none."""

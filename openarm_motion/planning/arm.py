@@ -435,6 +435,22 @@ class Arm(PlanningGroup):
             blocked = "" if contact is None else f"; on the direct way {contact}"
             raise PlanFailedError(Code.NO_PLAN, error.message + blocked, "search", contact) from error
 
+    def timing_into(self, path: PlannedPath, line: Array, way: Array, scale: Scale) -> PolylineTiming:
+        """Timings of a free path that goes on along a line; their last column is the way of the tool on the line.
+
+        Args:
+            path: Free path to the beginning of the line.
+            line: (k, n) configurations on it, rad.
+            way: (k,) of the tool from its beginning to them, m.
+            scale: Velocity scale of the request.
+        """
+        search, limits = self.config.planning, self.limits(scale)
+        points = np.vstack([path.waypoints, line])
+        gone = np.append(np.zeros(len(path.waypoints)), way)
+        speed = self.config.limits.straight_speed * self.scale(scale)
+        most = JointLimits(*(np.append(row, x) for row, x in zip(limits, (speed, np.inf, np.inf), strict=True)))
+        return PolylineTiming(search.timing, (*self.names, "way"), np.column_stack([points, gone]), most, search.period)
+
     def time_line(self, line: Line, scale: Scale) -> Trajectory:
         """Timed straight line."""
         speed = self.config.limits.straight_speed * self.scale(scale)

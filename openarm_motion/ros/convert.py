@@ -160,6 +160,7 @@ def approach_request(goal: PlanApproach.Goal) -> PlanApproachRequest:
         touchable=frozenset(goal.touchable),
         attached_after=goal.attached_after_approach,
         detached_after=goal.detached_after_approach,
+        blend=goal.blend_approach,
     )
     return PlanApproachRequest(
         goal.arm,

@@ -186,7 +186,7 @@ class MotionService:
             plan = await self.robot.compute(work)
             delay = await self.coordination.start_delay(arm, plan.transfer, wanted.attached, stopped)
             self.on_plan({arm.name: plan.parts})
-            self.memory.expect(arm.name, plan.transfer, wanted.attached)
+            self.memory.expect(arm.name, plan.transfer, wanted.attached, touches=wanted.blend)
             self.memory.expect(arm.name, plan.approach, wanted.attached, touches=True)
             self.memory.expect(arm.name, plan.retreat, plan.held_after)
             answer = replace(answer, message=f"planned{prepared.note}", start_delay=delay, plan=plan)

@@ -45,14 +45,15 @@ class PolylineTiming:
         self._tried = np.full(len(waypoints), len(_CAPS) - 1)
         if how == "blended":
             self._tried[1:-1] = 0
-        self._moments = np.zeros(len(waypoints))
+        #: When the last trajectory is in each of the way points, s; zeros, where it is quintic.
+        self.moments = np.zeros(len(waypoints))
 
     def trajectory(self) -> Trajectory:
         """The polyline timed, its corners rounded as far as is left to try."""
         if self._how == "quintic":
             return time_quintic(self._names, self._waypoints, self._limits, self._period)
         caps = np.array(_CAPS)[self._tried]
-        found, self._moments = time_rounded(self._names, self._waypoints, self._limits, caps, self._period)
+        found, self.moments = time_rounded(self._names, self._waypoints, self._limits, caps, self._period)
         return found
 
     def round_less(self, t: float) -> bool:
@@ -65,7 +66,7 @@ class PolylineTiming:
         if not left.size:
             return False
         if np.isfinite(t):
-            left = left[np.argmin(np.abs(self._moments[left] - t))]
+            left = left[np.argmin(np.abs(self.moments[left] - t))]
         self._tried[left] += 1
         return True
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -83,11 +83,11 @@ class Motion:
             return np.asarray(CubicHermiteSpline(self.t, self.q, self.v)(np.clip(times, self.t[0], self.t[-1])))
         return np.stack([np.interp(times, self.t, column) for column in self.q.T], axis=1)
 
-    def of(self, names: tuple[str, ...]) -> Motion:
+    def of(self, names: tuple[str, ...]) -> Self:
         """The motion of some of its joints."""
         k = [self.names.index(name) for name in names]
         v, a = (None if x is None else x[:, k] for x in (self.v, self.a))
-        return Motion(names, self.t, self.q[:, k], v, a)
+        return replace(self, names=names, q=self.q[:, k], v=v, a=a)
 
     def later(self, seconds: float) -> Motion:
         """The same, begun later; the arm rests before."""
@@ -115,6 +115,11 @@ class Trajectory(Motion):
         v = (v0 + u * (a0 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))) / h
         a = (a0 + u * (6.0 * c3 + u * (12.0 * c4 + u * 20.0 * c5))) / (h * h)
         return q, v, a
+
+    def between(self, first: int, last: int) -> Trajectory:
+        """The part from one sample to another, at the same times."""
+        k = slice(first, last + 1)
+        return replace(self, t=self.t[k], q=self.q[k], v=self.v[k], a=self.a[k])
 
     def coefficients(self, i: NDArray[np.int64]) -> tuple[Array, Array, Array, Array, Array, Array]:
         """Of the intervals that begin at samples `i` (k,), by the share u of each that has passed; (k, n) each.
@@ -348,6 +353,13 @@ def split(borders: Array, period: float) -> Array:
     passed = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     t = np.repeat(borders[:-1], counts) + passed * np.repeat(h / counts, counts)
     return np.append(t, borders[-1]).round(9)
+
+
+def joined(first: Trajectory, second: Trajectory) -> Trajectory:
+    """One trajectory, and another that begins at rest where that ends."""
+    t = np.append(first.t, (first.t[-1] + second.t[1:]).round(9))
+    q, v, a = (np.vstack([getattr(first, x), getattr(second, x)[1:]]) for x in "qva")
+    return Trajectory(first.names, t, q, v, a)
 
 
 def resting(names: Sequence[str], q: Array, period: float) -> Trajectory:

@@ -255,11 +255,18 @@ class World(Skills):
         shifted = (replace(d, T_base_object=T_off @ d.T_base_object) for d in seen.frames[-1].detections)
         return Frames((frame_of(*shifted, t_ns=seen.frames[-1].t_ns),) * count, seen.frame_id)
 
-    async def observe_towards_end(
-        self, motion: Callable[[], Awaitable[None]], near_end: Callable[[], bool], count: int
-    ) -> tuple[Frame, ...]:
+    async def towards_end(
+        self,
+        motion: Callable[[], Awaitable[None]],
+        near_end: Callable[[], bool],
+        work: Callable[[], Awaitable[None]],
+    ) -> None:
         await motion()
-        return (await self.observe(count)).frames
+        await work()
+
+    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
+        for part in parts:
+            await part()
 
     def in_base(self, seen: Frames) -> Frames:
         self.call(ToBase())
@@ -286,7 +293,7 @@ class World(Skills):
         if not within:
             self._reach(request.arm, request.targets[0].position)
         self._target, self._turn = request.targets[within[0]].position, request.targets[within[0]].yaw_offset
-        return self._planned(within[0], "carry", "put down", "leave")
+        return self._planned(within[0], "carry", "rest", "leave")
 
     def _planned(self, chosen: int, *names: str) -> Planned:
         transfer, approach, retreat = map(Path, names)
@@ -316,7 +323,14 @@ class World(Skills):
         return dict.fromkeys(arms, 0.2)
 
     async def follow(
-        self, arm: str, trajectory: object, what: str, *, carrying: bool = False, line: object = None
+        self,
+        arm: str,
+        trajectory: object,
+        what: str,
+        *,
+        carrying: bool = False,
+        line: object = None,
+        check: object = None,
     ) -> None:
         self.call(Follow(arm, str(trajectory), what, carrying))
         self.followed.append(trajectory)

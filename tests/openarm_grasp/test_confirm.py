@@ -86,7 +86,7 @@ def test_the_plan_that_is_shown_and_confirmed_is_executed_and_no_other(world: Wo
 
     shown = watched(world, nothing_has_moved)
     world.succeeds(confirm=True)
-    assert [names(plan) for plan in shown] == [["transfer", "approach", "lift", "carry", "put down", "leave"]]
+    assert [names(plan) for plan in shown] == [["transfer", "approach", "lift", "carry", "leave"]]
     assert is_executed(world, *shown)
 
 
@@ -197,8 +197,8 @@ def test_a_place_that_is_planned_anew_is_asked_about_again(world: World) -> None
     world.on_report = on_report
     world.succeeds(confirm=True)
     assert [names(plan) for plan in shown] == [
-        ["transfer", "approach", "lift", "carry", "put down", "leave"],
-        ["carry", "put down", "leave"],
+        ["transfer", "approach", "lift", "carry", "leave"],
+        ["carry", "leave"],
     ]
     first, second = shown
     done = [part for _, part in (*first.parts[:3], *second.parts)]
@@ -210,7 +210,7 @@ def test_each_phase_is_asked_about(world: World) -> None:
     world.succeeds(phase="pick", confirm=True)
     assert [names(plan) for plan in shown] == [["transfer", "approach", "lift"]]
     assert world.grasp("", phase="place", confirm=True, place=(0.3, -0.3)).success
-    assert [names(plan) for plan in shown[1:]] == [["carry", "put down", "leave"]]
+    assert [names(plan) for plan in shown[1:]] == [["carry", "leave"]]
     assert is_executed(world, *shown)
 
 
@@ -314,7 +314,7 @@ def test_the_controllers_get_the_trajectories_that_were_shown_bit_for_bit(monkey
     outcome = trials.link.run(pick_and_place(asked, asked.request))
     assert outcome.success, outcome.message
     (plan,) = shown
-    assert names(plan) == ["transfer", "approach", "lift", "carry", "put down", "leave"]
+    assert names(plan) == ["transfer", "approach", "lift", "carry", "leave"]
     for (name, part), motion in zip(plan.parts, started, strict=False):
         assert isinstance(part, Motion)
         for what in ("t", "q", "v", "a"):

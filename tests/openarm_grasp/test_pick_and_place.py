@@ -4,15 +4,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from openarm_bringup import load_graph
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_evaluation.campaign.in_process_robot import InProcessRobot
+from openarm_grasp.config import LEAST_SCALE, GraspConfig
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
+from openarm_motion.service.requests import ApproachAnswer, PlanApproachRequest
 from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Observe, ToBase
 from tests.refusals import refused
 
@@ -61,6 +67,26 @@ def test_a_request_has_its_own_speed_or_that_of_the_configuration(world):
     for wrong in (-0.1, 1e-4, 1.5, float("nan")):
         check = GraspRequest("red", velocity_scale=wrong).check
         assert refused("expected 0.001 to 1", check, ("left", "right")).code is Code.INVALID_ARGUMENT
+
+
+def test_no_speed_falls_below_the_least_that_is_accepted(world):
+    """Each failure halves it, and a push takes a quarter."""
+    world.slips = 2
+    assert world.succeeds(velocity_scale=LEAST_SCALE).attempts == 3
+    assert world.velocity_scale == LEAST_SCALE
+    asked = list[PlanApproachRequest]()
+
+    async def plan_approach(request, stopped) -> ApproachAnswer:
+        asked.append(request)
+        return ApproachAnswer(OpenArmError(Code.NO_PLAN, "no way"), "no way")
+
+    robot: Any = SimpleNamespace(description=RobotDescription.load(), states=None, together=None)
+    robot.motion = SimpleNamespace(plan_approach=plan_approach)
+    link = InProcessRobot(robot, GraspConfig())
+    for scale in (1.0, 2.0 * LEAST_SCALE):
+        link.velocity_scale = scale
+        refused("no way", link.run, link.plan(PlanGrasp("left", (), (), (), velocity_scale=0.25)))
+    assert [one.scale for one in asked] == [0.25, LEAST_SCALE]
 
 
 @pytest.mark.requirement("B-71")

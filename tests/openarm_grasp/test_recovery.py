@@ -164,8 +164,15 @@ def test_a_place_that_is_not_seen_within_2_cm_is_tried_again(world):
     assert world.ends(Code.PLACE_FAILED, "30 mm from where it was put down").attempts == 3
 
 
-def test_a_place_that_cannot_be_planned_puts_the_object_back(world):
+def test_a_place_that_is_planned_in_vain_during_the_lift_is_planned_again_from_where_the_arm_is(world):
     world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN, times=1)
+    assert world.succeeds().attempts == 1
+    first, second = world.done(PlanPlace)
+    assert (str(first.after), second.after) == ("lift", None)
+
+
+def test_a_place_that_cannot_be_planned_puts_the_object_back(world):
+    world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN, times=2)
     outcome = world.ends(Code.PLACE_FAILED)
     assert world.objects["red"].p_base[:2] == pytest.approx((0.26, -0.2))
     assert not world.session.kept
@@ -284,14 +291,18 @@ def test_what_has_turned_in_the_hand_is_put_back_though_the_map_shows_it_there(w
         await follow(arm, trajectory, what, **kwargs)
         if what == "put back":
             world.objects["red"] = stood
-            if meets and str(trajectory) == "put down":
+            if meets and str(trajectory) == "carry":
                 raise OpenArmError(Code.EXECUTION_FAILED, "the tool ended 14 mm from its goal; blocked?")
 
     world.follow = back
     outcome = world.ends(Code.GRASP_LOST)
     assert outcome.attempts == 3
     assert not outcome.held
-    for plan in world.done(PlanPlace):
+    back_there = [
+        plan for plan in world.done(PlanPlace) if plan.after is None
+    ]  # the others were planned during the lift
+    assert len(back_there) == 3
+    for plan in back_there:
         assert plan.held == ()
         assert len(plan.ignore_regions) == 2
         assert plan.targets[0].approach_offset[2] > 0.05
@@ -306,7 +317,7 @@ def test_what_meets_something_just_above_its_place_is_let_go_there(world, above,
         return se3.make(p=(0.0, 0.0, above)) @ place
 
     world.T_base_tcp = hand
-    world.fail(world.follows_path("put down"), Code.EXECUTION_FAILED, times=1)
+    world.fail(world.follows_path("carry"), Code.EXECUTION_FAILED, times=1)
     assert world.succeeds().attempts == (1 if let_go else 2)
 
 
@@ -336,7 +347,7 @@ def test_what_a_hand_kept_is_let_go_where_it_meets_something_and_taken_from_ther
         )
 
     world.T_base_tcp = hand
-    world.fail(world.follows_path("put down"), Code.EXECUTION_FAILED, times=1)
+    world.fail(world.follows_path("carry"), Code.EXECUTION_FAILED, times=1)
     assert world.succeeds(phase="place").attempts == 2
     assert not world.session.kept
     assert any("50 mm above its place" in status.reason for status in world.status)

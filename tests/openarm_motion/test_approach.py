@@ -19,10 +19,12 @@ from openarm_motion.planning import arm as arm_module
 from openarm_motion.planning.alternative import explained_approach
 from openarm_motion.planning.approach import ApproachFailedError, ApproachRequest, Target, plan_approach
 from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.ompl_planner import OmplPlanner
 from openarm_motion.planning.planner import PlannedPath, PlanQuery
 from openarm_motion.timing.trajectory import Trajectory
 from openarm_motion.timing.validation import keeps_clear, validate_trajectory
+from tests.openarm_motion.conftest import shares_of_limits
 
 TABLE_Z = 0.40
 UP = np.array([0.0, 0.0, 0.12])
@@ -325,3 +327,85 @@ def test_bad_requests_are_refused(right: Arm, home: dict[str, float]) -> None:
         plan_approach(right, now, ApproachRequest((good,), attached_after=True, detached_after=True))
     with pytest.raises(OpenArmError, match="target 'g' has numbers that are not finite"):
         plan_approach(right, now, ApproachRequest((replace(good, score=float("nan")),)))
+
+
+def place(x: float, y: float, *others: Box, blend: bool = True) -> ApproachRequest:
+    """A cube in the hand, and three ways to put it down."""
+    held = box_from("cube", (0.0, 0.0, -0.012), (0.05, 0.05, 0.05))
+    ways = tuple(
+        replace(grasp(f"spot/{k}", x, y, 0.06, k * np.pi / 2), approach_offset=0.08 * UP / 0.12) for k in range(3)
+    )
+    return ApproachRequest(ways, others, (held,), detached_after=True, blend=blend)
+
+
+@pytest.mark.parametrize("scale", [0.05, 1.0])
+@pytest.mark.parametrize(("side", "x", "y"), [("left", 0.30, 0.30), ("right", 0.22, -0.12), ("right", 0.33, -0.28)])
+def test_a_place_is_reached_without_a_stop_before_the_line_and_within_all_limits(
+    arms: dict[str, Arm], home: dict[str, float], side: str, x: float, y: float, scale: float
+) -> None:
+    arm = arms[side]
+    now = arm.start_state(home, scale=scale)
+    stops, plan = (plan_approach(arm, now, place(x, y, blend=blend)) for blend in (False, True))
+    assert plan.chosen == stops.chosen
+    whole, T = plan.transfer, place(x, y).targets[plan.chosen].pose
+    assert whole.duration < stops.transfer.duration + stops.approach.duration - 0.05
+    assert max(shares_of_limits(whole, arm.limits(scale))) <= 1.0 + 1e-6
+    np.testing.assert_allclose(whole.q[-1], stops.approach.q[-1], atol=1e-9)
+    np.testing.assert_allclose(plan.approach.q, whole.q[[-1, -1]])
+    np.testing.assert_allclose(plan.retreat.q[0], whole.q[-1], atol=1e-9)
+
+    q, v, _ = whole.at(np.arange(0.0, whole.duration, 0.002))
+    poses = arm.kinematics.fk_many(q)
+    above = poses[:, 2, 3] - T[2, 3]
+    low = np.flatnonzero(above < 0.05)
+    assert np.abs(poses[low, :2, 3] - T[:2, 3]).max() < 0.001, "off the straight line near the place, m"
+    assert max(se3.angle_between(pose[:3, :3], T[:3, :3]) for pose in poses[low]) < 0.01
+    moving = np.abs(v[50:-50]).max(axis=1) / scale
+    assert moving[int(np.argmin(np.abs(above[50:-50] - 0.08)))] > 0.05, "it does not stop where the line begins"
+    speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / 0.002
+    assert speed[low[low < len(speed)]].max() <= arm.config.limits.straight_speed * scale * 1.01
+
+
+@pytest.mark.parametrize("timing", ["stops", "quintic"])
+def test_a_place_is_reached_with_a_stop_where_free_paths_have_stops(
+    right: Arm, home: dict[str, float], monkeypatch: pytest.MonkeyPatch, timing: str
+) -> None:
+    config = right.config.model_copy(update={"planning": right.config.planning.model_copy(update={"timing": timing})})
+    monkeypatch.setattr(right, "config", config)
+    now = right.start_state(home)
+    stops, plan = (plan_approach(right, now, place(0.30, -0.25, blend=blend)) for blend in (False, True))
+    assert plan.transfer.duration == pytest.approx(stops.transfer.duration + stops.approach.duration)
+    np.testing.assert_allclose(plan.transfer.at(stops.transfer.duration)[1], 0.0, atol=1e-9)
+
+
+def test_the_corner_before_a_place_keeps_clear_of_what_stands_around_it(right: Arm, home: dict[str, float]) -> None:
+    now, rng, gains = right.start_state(home), np.random.default_rng(7), list[float]()
+    for _ in range(16):
+        angle, off, height = rng.uniform((0.0, 0.09, 0.05), (2.0 * np.pi, 0.13, 0.30))
+        x, y = 0.28 + off * np.cos(angle), -0.25 + off * np.sin(angle)
+        request = place(0.28, -0.25, box_from("post", (x, y, TABLE_Z + height / 2), (0.02, 0.02, height)))
+        try:
+            stops = plan_approach(right, now, replace(request, blend=False))
+        except ApproachFailedError:
+            continue
+        plan = plan_approach(right, now, request)
+        gains.append(stops.transfer.duration + stops.approach.duration - plan.transfer.duration)
+        scene = right.scene(home, request.obstacles, request.attached, straight=True)
+        validate_trajectory(scene, plan.transfer, travel=0.002)
+    assert len(gains) >= 8
+    assert min(gains) >= 0.0
+    assert max(gains) > 0.1
+
+
+def test_a_corner_that_cannot_be_rounded_has_a_stop(
+    right: Arm, home: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(scene: CollisionScene, trajectory: Trajectory) -> None:
+        if np.any(trajectory.v[[0, -1]]):  # a part of a whole
+            raise PlanFailedError(Code.IN_COLLISION, "it touches", "certificate", at=float(trajectory.t[-1]))
+
+    now = right.start_state(home)
+    stops = plan_approach(right, now, place(0.28, -0.25, blend=False))
+    monkeypatch.setattr(approach_module, "validate_trajectory", refuse)
+    plan = plan_approach(right, now, place(0.28, -0.25))
+    assert plan.transfer.duration == pytest.approx(stops.transfer.duration + stops.approach.duration)

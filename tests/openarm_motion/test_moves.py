@@ -9,6 +9,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_grasp.config import LEAST_SCALE
 from openarm_motion.collision.solids import Box
 from openarm_motion.config import LimitsConfig, MotionConfig
 from openarm_motion.planning import moves
@@ -108,6 +109,11 @@ def test_start_states_are_checked(right: Arm, home: dict[str, float]) -> None:
     refused(Code.LIMITS, right.start_state, home, [0, 0, 0, -0.2, 0, 0, 0])
     # a joint that sags a little below its limit is a reading, not a fault
     assert right.start_state(home, [0, 0, 0, -0.01, 0, 0, 0]).start[3] == 0.0
+
+
+def test_the_slowest_motion_of_a_grasp_is_one_that_is_planned(right: Arm) -> None:
+    assert right.scale(LEAST_SCALE) == LEAST_SCALE
+    assert "expected 0.001 to 1" in refused(Code.INVALID_ARGUMENT, right.scale, 0.99 * LEAST_SCALE)
 
 
 def test_velocity_scale_stretches_time(right: Arm, home: dict[str, float]) -> None:

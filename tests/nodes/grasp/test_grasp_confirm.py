@@ -12,7 +12,7 @@ from openarm_grasp.ros.client import GraspClient, GraspResult
 
 pytestmark = [pytest.mark.requirement("P-20", "R-25"), pytest.mark.long]
 
-PARTS = ["transfer", "approach", "lift", "carry", "put down", "leave"]
+PARTS = ["transfer", "approach", "lift", "carry", "leave"]
 
 
 def waiting(bench, *before: str) -> GraspStatus:
