@@ -174,7 +174,8 @@ class InProcessRobot:
             raise NoWayError(answer.code, answer.message, refusals) from answer.error
         transfer, duration = plan.transfer, sum(part.duration for part in plan.parts)
         start = dict(zip(transfer.names, transfer.q[0].tolist(), strict=True))
-        return Planned(plan.chosen, *plan.parts, refusals, plan.limit_margins, start, duration, answer.scene_version)
+        parts = (plan.transfer, None if request.blend else plan.approach, plan.retreat)
+        return Planned(plan.chosen, *parts, refusals, plan.limit_margins, start, duration, answer.scene_version)
 
     async def scene_version(self) -> int:
         """Version of the planning scene of the motion service."""
@@ -276,6 +277,6 @@ def approach_of(request: PlanGrasp | PlanPlace) -> ApproachRequest:
             boxes_of((*request.obstacles, *request.target)),
             frozenset(box.id for box in request.target),
         )
-        return ApproachRequest(targets, obstacles, touchable=touchable, attached_after=True)
+        return ApproachRequest(targets, obstacles, (), touchable, attached_after=True, blend=request.blend)
     held = boxes_of(request.held)
-    return ApproachRequest(targets, boxes_of(request.obstacles), held, detached_after=True, blend=True)
+    return ApproachRequest(targets, boxes_of(request.obstacles), held, detached_after=True, blend=request.blend)

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from openarm_grasp.robot.interface import Planned, Trajectory
     from openarm_grasp.robot.skills import Skills
 
-#: Names of the parts of a plan, as they are shown; a carry goes on to the place, and no approach is left.
+#: Names of the parts of a plan, as they are shown.
 GRASP = ("transfer", "approach", "lift")
-PLACE = ("carry", "", "leave")
+PLACE = ("carry", "put down", "leave")
 PUSH = ("move behind", "move down", "push")
 
 
@@ -111,7 +111,7 @@ async def agree(
         return ""
     robot = task.robot
     every = (part for names, p in plans for part in zip(names, (p.transfer, p.approach, p.retreat), strict=True))
-    parts = tuple((name, trajectory) for name, trajectory in every if name)
+    parts = tuple((name, trajectory) for name, trajectory in every if trajectory is not None)
     shown = ShownPlan(f"p{token_hex(3)}", arm, parts)  # a letter first: YAML takes it for a string
     text = f"{text}; {sum(plan.duration for _, plan in plans):.1f} s of motion"
     before = {**robot.joints(), **plans[0][1].start}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import ClassVar, Protocol, TypeAlias
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
@@ -32,6 +32,7 @@ class PlanGrasp:
         ignore_regions: Where the object will not stand any more then: the map still shows it there.
         start: Joints that it starts from: of the lift, then of the arm, rad and m; empty: the present ones.
         velocity_scale: Share of the speed of other motions.
+        blend: The transfer goes on to the grasp without a stop, as it does to a place.
     """
 
     arm: str
@@ -41,6 +42,7 @@ class PlanGrasp:
     ignore_regions: tuple[Box, ...] = ()
     start: tuple[float, ...] = ()
     velocity_scale: float = 1.0
+    blend: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class PlanPlace:
     after: Trajectory | None = None
     ignore_regions: tuple[Box, ...] = ()
     velocity_scale: float = 1.0
+    blend: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
@@ -77,8 +80,8 @@ class Planned:
 
     Attributes:
         chosen: Index of the way.
-        transfer: Free path to the beginning of the approach; of a place, it goes on to where it lets go.
-        approach: Straight line to where it grasps; of a place, a rest where it lets go.
+        transfer: Free path to the beginning of the approach.
+        approach: Straight line to where it grasps or lets go; None: the transfer goes on to there without a stop.
         retreat: Straight line away.
         refusals: Why others were refused, by id.
         limit_margins: Of each way, how near it comes to a joint limit, rad; NaN: refused or not evaluated. Empty when

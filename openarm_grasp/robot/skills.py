@@ -196,6 +196,7 @@ class Skills:
         now: Sighting | None = None,
         *,
         at_height: float | None = None,
+        blend: bool = False,
     ) -> Planned:
         """Plan one of several grasps.
 
@@ -205,6 +206,7 @@ class Skills:
             found: The object and its neighbours.
             now: The object where it stands until then, when that is elsewhere: the map shows it there.
             at_height: Position that the lift has then, m; None: where it is.
+            blend: The transfer goes on to the grasp without a stop.
         """
         config, start = self._config, tuple[float, ...]()
         if at_height is not None:
@@ -213,7 +215,7 @@ class Skills:
         target = target_boxes(found.target, ways[0] if ways else None, config)
         obstacles = neighbours(found, target, config)
         gone = () if now is None else (target_box(now.target, config),)
-        return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone, start))
+        return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone, start, blend=blend))
 
     async def plan_push(
         self,
@@ -302,7 +304,7 @@ class Skills:
             trajectory: Trajectory of the planner.
             what: For errors, for example "lift".
             carrying: A hand that closes or slips stops it.
-            line: Ends (3,) of the straight line that the TCP follows, base frame, m; leaving it by more than
+            line: Ends (3,) of the straight line that the TCP follows at last, base frame, m; leaving it by more than
                 `path_tolerance` stops it.
             check: Called on the way; what it raises stops the arm.
 
@@ -543,7 +545,7 @@ class Skills:
 
 
 def _off_line(p: Array, begin: Array, end: Array) -> float:
-    """Distance of a point from a line segment, m."""
+    """Distance of a point from a line segment, m; 0 before its beginning."""
     way = end - begin
-    share = float(np.clip((p - begin) @ way / (way @ way), 0.0, 1.0))
-    return float(np.linalg.norm(p - begin - share * way))
+    share = min(float((p - begin) @ way / (way @ way)), 1.0)
+    return 0.0 if share < 0.0 else float(np.linalg.norm(p - begin - share * way))

@@ -222,7 +222,7 @@ class GraphRobot:
         goal = messages.plan_goal(request, slowed(self.velocity_scale, request.velocity_scale))
         what = f"{request.arm} arm: planning"
         result = await self._nodes.goal(self._plan, goal, self._config.limits.plan_timeout, what, self._watched(None))
-        return messages.planned_from_msg(result, len(goal.targets))
+        return messages.planned_from_msg(result, len(goal.targets), blend=request.blend)
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """Ask /motion/compute_ik."""

@@ -217,6 +217,7 @@ def plan_goal(request: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanAppr
         arm=request.arm,
         ignore_regions=[box_to_msg(box) for box in request.ignore_regions],
         velocity_scale=velocity_scale,
+        blend_approach=request.blend,
     )
     if isinstance(request, PlanGrasp):
         goal.targets = _targets(request.candidates)
@@ -226,8 +227,7 @@ def plan_goal(request: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanAppr
         return goal
     goal.targets = _targets(request.targets)
     goal.obstacles = [box_to_msg(box) for box in request.obstacles]
-    goal.attached = [box_to_msg(box) for box in request.held]
-    goal.detached_after_approach = goal.blend_approach = True
+    goal.attached, goal.detached_after_approach = [box_to_msg(box) for box in request.held], True
     if request.after is not None:
         points = getattr(request.after, "points", None)
         if not points:
@@ -249,8 +249,8 @@ def _targets(ways: Iterable[GraspCandidate | PlaceTarget]) -> list[ApproachTarge
     ]
 
 
-def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
-    """A plan, or why there is none.
+def planned_from_msg(result: PlanApproach.Result, offered: int, *, blend: bool = False) -> Planned:
+    """A plan, blended or not, or why there is none.
 
     Raises:
         OpenArmError: With the planner's code, when it found no plan; INTERNAL, when it chose what was not offered.
@@ -267,7 +267,7 @@ def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
     return Planned(
         result.chosen,
         result.transfer,
-        result.approach,
+        None if blend else result.approach,
         result.retreat,
         refusals,
         tuple(result.limit_margins),

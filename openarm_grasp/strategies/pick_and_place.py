@@ -12,6 +12,7 @@ from __future__ import annotations
 import traceback
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -189,7 +190,8 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
     run.hand = Hand.AT_OBJECT
     c = grasp.candidate
     p = c.T_base_tcp[:3, 3]
-    await robot.follow(arm, plan.approach, "move to the grasp", line=(p + c.approach_offset, p))
+    into = plan.transfer if plan.approach is None else plan.approach
+    await robot.follow(arm, into, "move to the grasp", line=(p + c.approach_offset, p))
     error, limit = (await robot.measure(arm, c.width, c.T_base_tcp)).tcp_error, config.held.max_tcp_error
     if error > limit:
         text = f"the hand stopped {error * 1e3:.1f} mm from the grasp, expected at most {limit * 1e3:.0f} mm"
@@ -198,7 +200,7 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
 
 
 async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[Grasp, Planned, str]:
-    """Observe with the camera on the hand, and go where the object is seen from there.
+    """Observe with the camera on the hand, and plan to where the object is seen from there.
 
     Whatever keeps the second observation from helping, the grasp goes on with what is known.
     """
@@ -214,7 +216,7 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[
     run.enter(State.MOVE_TO_PREGRASP, f"{why}; correcting")
     robot.stop_observing()
     try:
-        plan = await robot.plan_grasp(grasp.arm, run.offered, corrected.sighting)
+        plan = await robot.plan_grasp(grasp.arm, run.offered, corrected.sighting, blend=True)
     except OpenArmError as error:
         reraise_stop(error)
         if run.request.confirm:
@@ -224,9 +226,7 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned, camera: str) -> tuple[
     run.grasp, run.place_plan, why = corrected, None, f"correcting to {corrected.candidate.id}"
     if changed := await agreed(run, State.MOVE_TO_PREGRASP, corrected, why, plan):
         raise OpenArmError(Code.GRASP_MISSED, changed)
-    run.enter(State.MOVE_TO_PREGRASP, why)
-    await robot.follow(grasp.arm, plan.transfer, "correct the pre-grasp")
-    return corrected, plan, "the open hand is before the object"
+    return corrected, plan, why
 
 
 # --- grasp
@@ -352,7 +352,7 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
 
 
 async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str, *, last: bool) -> Placed:
-    """Plan, carry, see that the hand still holds the object, put it down, let go, leave.
+    """Plan, carry, see that the hand still holds the object, put it down, let go, and leave while the hand opens wide.
 
     Args:
         run: The request.
@@ -366,26 +366,36 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
     if ways is grasp.places:
         run.place_target = target
     run.enter(State.PLACE, f"carrying to {target.id}")
+    reason, opened = (
+        "put down and let go" if ways is grasp.places else "put back where it stood",
+        grasp.candidate.opened,
+    )
+
+    async def leave() -> None:
+        nonlocal reason
+        run.hand = Hand.RELEASED
+        try:
+            await robot.follow(arm, plan.retreat, "leave")
+            if opened is not None:
+                await robot.open(arm, "open")
+        except OpenArmError as error:
+            reraise_stop(error)
+            reason = error.message
+        else:
+            run.hand = Hand.CLEAR
+
     try:
         gripper, failure = await _carry(run, grasp, plan, target, last=last)
-        await robot.open(arm, "release", grasp.candidate.opened, held=robot.aperture(arm))
+        held = robot.aperture(arm)
+        let_go = held + run.config.hand.lets_go
+        release = partial(robot.open, arm, "release", opened, held=held)
+        await robot.towards_end(release, lambda: robot.aperture(arm) >= let_go, leave)
     except OpenArmError as error:
         if error.code is Code.GRASP_LOST:
             run.hand = Hand.FREE
         else:
             run.used_places = (*run.used_places, target)
         raise
-    run.hand = Hand.RELEASED
-    reason = "put down and let go" if ways is grasp.places else "put back where it stood"
-    try:
-        await robot.follow(arm, plan.retreat, "leave")
-        if grasp.candidate.opened is not None:
-            await robot.open(arm, "open")
-    except OpenArmError as error:
-        reraise_stop(error)
-        reason = error.message
-    else:
-        run.hand = Hand.CLEAR
     return Placed(target, gripper, reason, failure)
 
 

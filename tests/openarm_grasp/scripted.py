@@ -288,15 +288,15 @@ class World(Skills):
         if isinstance(request, PlanGrasp):
             self._reach(request.arm, request.candidates[0].T_base_tcp[:2, 3])
             self._label = request.target[0].id.removeprefix("target/")
-            return self._planned(0, "transfer", "approach", "lift")
+            return self._planned(0, "transfer", "" if request.blend else "approach", "lift")
         within = [i for i, way in enumerate(request.targets) if self.reaches(request.arm, way.position)]
         if not within:
             self._reach(request.arm, request.targets[0].position)
         self._target, self._turn = request.targets[within[0]].position, request.targets[within[0]].yaw_offset
-        return self._planned(within[0], "carry", "rest", "leave")
+        return self._planned(within[0], "carry", "", "leave")
 
     def _planned(self, chosen: int, *names: str) -> Planned:
-        transfer, approach, retreat = map(Path, names)
+        transfer, approach, retreat = (Path(name) if name else None for name in names)
         return Planned(chosen, transfer, approach, retreat, start=dict(self.q), duration=3.0, scene_version=self.scene)
 
     def joints(self) -> dict[str, float]:

@@ -105,4 +105,4 @@ def test_a_second_look_corrects_the_grasp_before_the_hand_goes_down(worlds, box)
     first, second = world.done(PlanGrasp)
     assert (len(first.candidates), len(second.candidates)) == (28, 1)
     assert second.candidates[0].T_base_tcp[0, 3] == pytest.approx(0.27)
-    assert [call.trajectory for call in world.done(Follow)][:3] == ["transfer", "transfer", "approach"]
+    assert [call.trajectory for call in world.done(Follow)][:3] == ["transfer", "transfer", "lift"]
