@@ -165,11 +165,11 @@ def _reach(one: Detection, others: Sequence[Detection], side: tuple[float, float
 
 
 def _trouble(one: Detection, detections: Sequence[Detection]) -> float:
-    """How hard an object is to take: what lies over it counts most, then neighbours, then a box that is unsure.
+    """How hard an object is to take, in tenths: what lies over it counts most, then neighbours, then an unsure box.
 
     Fingers go down to about the middle of an object: what is lower is in no way.
     """
     higher = [(gap(one, other), other.top) for other in detections if other is not one and other.top > one.p_base[2]]
     under = sum(distance < _TOUCHING and top > one.top + _HIGHER for distance, top in higher)
     crowd = 1.0 - min([_ROOM, *(distance for distance, _ in higher)]) / _ROOM
-    return 2.0 * under + crowd + (1.0 - one.score) + 4.0 * (not one.measured)
+    return round(2.0 * under + crowd + (1.0 - one.score) + 4.0 * (not one.measured), 1)

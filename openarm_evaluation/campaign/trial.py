@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import time
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -24,11 +25,11 @@ from openarm_evaluation.campaign.in_process_robot import InProcessRobot
 from openarm_evaluation.campaign.mounts import with_mounts
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.parameters import suite_config
-from openarm_evaluation.campaign.robot import UNKNOWN, Known, SimRobot, SimulatedSenses
+from openarm_evaluation.campaign.robot import UNKNOWN, Known, SimRobot, SimulatedSenses, together, turn
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, watch_clearance
-from openarm_evaluation.judging.judge import RULES, judge, rests, rise_of
+from openarm_evaluation.judging.judge import RULES, Sample, judge, rests, rise_of
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial, choose_targets, higher_by
 from openarm_grasp.config import GraspConfig
@@ -37,6 +38,7 @@ from openarm_grasp.requests.orders import Order
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.requests.task import GraspSession, Status
 from openarm_grasp.requests.task import Task as GraspTask
+from openarm_grasp.robot.coordination import ArmCoordination, coordinated
 from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pair import Pair
@@ -86,6 +88,7 @@ class Trials:
         )
         self.link = InProcessRobot(self.robot, config)
         self.skills = Skills(self.link, config)
+        self._coordination = ArmCoordination()
         self.session = GraspSession(
             GraspContext.of(config, self.robot.table, self.robot.description, self.robot.mounted)
         )
@@ -103,10 +106,11 @@ class Trials:
         began = time.monotonic()
         self.robot.pass_time(_SETTLE_S)
         self._begin_fault("")
-        clearance = watch_clearance(self.robot) if self._task.set_name.startswith("pairs") else None
+        two = self._task.together or self._task.set_name == "pairs_in_turn"
+        clearance = watch_clearance(self.robot) if two else None
         began_ns = self.robot.t_ns
         pair = self._task.together and not self._task.clear
-        trials = self._both([GraspRequest(label) for label in self._task.labels]) if pair else self._all_in_turn()
+        trials = self._both([GraspRequest(label) for label in self._task.labels]) if pair else self._ordered()
         row = row_of(self._task, trials, time.monotonic() - began)
         row["again"], row["left"] = self._again, list(self._left)
         row["sim_s"] = round(self._seconds, 2) or row["sim_s"]
@@ -117,19 +121,25 @@ class Trials:
             self._keep.write(row, [step.__dict__ for step in self.steps])
         return row
 
-    def _all_in_turn(self) -> list[Trial]:
+    def _ordered(self) -> list[Trial]:
         """Grasp what is asked for; what others hide or block is asked for again when they have been placed."""
-        labels, clear = self._task.labels, self._task.clear
+        task, labels, clear = self._task, self._task.labels, self._task.clear
         if not clear and len(set(labels)) < len(labels):  # the same object more than once
-            return [self._grasp(GraspRequest(label)) for label in labels]
-        order, placed, open_ = Order(labels, each=0 if clear else Counter(labels)), list[Trial](), dict[object, Trial]()
-        while first := order.next():
-            other = order.next_to(first) if self._task.together else None
-            asked = (first,) if other is None else (first, other)
-            trials = [self._grasp(first)] if other is None else self._both(asked)
-            began_ns = min(step.t_ns for trial in trials for step in trial.steps[:1])
-            self._seconds += (max(step.t_ns for trial in trials for step in trial.steps[-1:]) - began_ns) * 1e-9
-            for ask, trial in zip(asked, trials, strict=True):
+            return [self.link.run(self._grasp(GraspRequest(label))) for label in labels]
+        arms = self.robot.description.arm_names if task.together else ()
+        order, placed, open_ = (
+            Order(labels, each=0 if clear else Counter(labels), arms=arms),
+            list[Trial](),
+            dict[object, Trial](),
+        )
+
+        async def work() -> None:
+            while (ask := order.next()) is not None or order.running:
+                if ask is None:
+                    await turn()
+                    continue
+                trial = await self._grasp(ask)
+                self._seconds += trial.sim_s
                 answer, touched = trial.answer, trial.answer.attempts > 0
                 held = isinstance(answer, GraspOutcome) and answer.held
                 ends = answer.place_position, answer.object_position
@@ -146,6 +156,8 @@ class Trials:
                     open_[label] = trial
                 if touched and not clear:  # three attempts are what a scene may take
                     order.failed[label] = answer.message
+
+        self.link.run(together([work] * max(1, len(arms))))
         # what was taken twice does not count for two
         done = len({trial.target for trial in placed}) if clear else len(placed)
         self._left, missing = order.faults(), len(labels) - done
@@ -153,47 +165,69 @@ class Trials:
         # what nothing was asked about was not seen: the last answer says so
         return [*placed, *(last + last[-1:] * missing)[:missing]]
 
-    def _grasp(self, ask: GraspRequest) -> Trial:
-        task, began, first = self._task, time.monotonic(), len(self.steps)
-        self._begin(lifted=ask.phase == "place")
-        request = replace(ask, arm=task.arm, place=task.place, place_on=task.place_on)
+    async def _grasp(self, ask: GraspRequest) -> Trial:
+        """Carry out one request and judge it: at once where the other arm may be at work, else when all is at rest."""
+        task, robot, began, steps = self._task, self.robot, time.monotonic(), list[Step]()
+        arms = (ask.arm,) if ask.arm != "auto" else robot.description.arm_names
+        if not task.together:
+            await self._begin(lifted=ask.phase == "place")
+        since_ns = robot.t_ns
+        request = replace(ask, arm=task.arm if ask.arm == "auto" else ask.arm, place=task.place, place_on=task.place_on)
         try:
-            outcome = self.link.run(carry_out(self.grasp_task(request)))
+            with self._coordination.taking(arms, ask.label):
+                outcome = await carry_out(self.grasp_task(request, steps, alone=len(arms) > 1))
         except OpenArmError as error:
             outcome = GraspOutcome(error.code, error.message, ask.label)
         wall_s = time.monotonic() - began
-        return self._trial(ask.label, outcome, self.steps[first:], wall_s)
+        return await self._trial(
+            ask.label, outcome, steps, wall_s, since_ns if task.together and ask.phase != "place" else 0
+        )
 
-    def _begin(self, *, lifted: bool = False) -> None:
+    async def _begin(self, *, lifted: bool = False) -> None:
         """Forget how objects have moved; what is held has been lifted before."""
         for track in () if lifted else self.robot.tracks.values():
             track.clear()
-        self.robot.pass_time(0.1)
+        await self.robot.wait(0.1)
 
     def _both(self, asked: Sequence[GraspRequest]) -> list[Trial]:
         """Ask for two objects at once, of both arms."""
         began = time.monotonic()
         steps: tuple[list[Step], list[Step]] = ([], [])
+        robots: dict[str, RobotInterface] = {arm: self.link.next_to_other() for arm in self.robot.description.arm_names}
+        first, second = asked
 
         def report(status: Status) -> None:
             self._report(status)
             steps[status.request].append(self.steps[-1])
 
-        robots: dict[str, RobotInterface] = {arm: self.link.next_to_other() for arm in self.robot.description.arm_names}
-        first, second = asked
         pair = Pair(self.session, self.skills, robots, (first, second), report, carry_out)
-        self._begin()
+        self.link.run(self._begin())
         outcomes: Sequence[GraspOutcome]
         try:
             outcomes = self.link.run(carry_out_pair(pair)).answers
         except OpenArmError as error:
             outcomes = [GraspOutcome(error.code, error.message, ask.label) for ask in asked]
         wall_s, labels = 0.5 * (time.monotonic() - began), [ask.label for ask in asked]
-        return [self._trial(*each, wall_s) for each in zip(labels, outcomes, steps, strict=True)]
+        return [self.link.run(self._trial(*each, wall_s)) for each in zip(labels, outcomes, steps, strict=True)]
 
-    def grasp_task(self, request: GraspRequest) -> GraspTask:
-        """A request, to be carried out by a strategy."""
-        return GraspTask(self.session, self.skills, request, self._report)
+    def grasp_task(self, request: GraspRequest, steps: list[Step] | None = None, *, alone: bool = True) -> GraspTask:
+        """A request, to be carried out by a strategy.
+
+        Args:
+            request: What is asked for.
+            steps: Gets the states that it enters.
+            alone: No other is carried out meanwhile.
+        """
+
+        def report(status: Status) -> None:
+            self._report(status)
+            if steps is not None:
+                steps.append(self.steps[-1])
+
+        skills = self.skills
+        if not alone:
+            skills = coordinated(request.arm, self.link.next_to_other(), self._coordination, self._config)
+        return GraspTask(self.session, skills, request, report)
 
     # --- while it runs
     def _report(self, status: Status) -> None:
@@ -228,10 +262,19 @@ class Trials:
         # Blocked on every side: it is not pushed, and the task is a nominal one.
 
     # --- after it
-    def _trial(self, asked: str, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
+    async def _trial(
+        self, asked: str, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float, since_ns: int = 0
+    ) -> Trial:
         """Judge the object that was asked for; where there are several, that which was taken.
 
         Of those that were lifted it is the one that is nearest to where it was put, else the one that went highest.
+
+        Args:
+            asked: Words for it.
+            outcome: The answer.
+            steps: States that were entered.
+            wall_s: Duration, s of wall clock.
+            since_ns: When it was asked for, where the other arm may be at work; 0: when all was at rest last.
         """
         robot, task, end_ns = self.robot, self._task, self.robot.t_ns
         names: list[str] = []
@@ -239,27 +282,34 @@ class Trials:
             names = [item.name for item in choose_targets(task.scene, asked)]
         if not names:
             return Trial(task.scene, task.seed, "", outcome, None, steps, wall_s, end_ns)
-        self._rest(names)
+        if not since_ns:
+            await self._rest(names)
+        tracks = {name: _since(robot.tracks[name], since_ns) for name in names}
         where, seen = outcome.place_position, outcome.object_position
         xy = (where[0], where[1]) if any(where) else (math.nan, math.nan)
-        name = max(names, key=lambda n: rise_of(robot.tracks[n]))
-        lifted = [n for n in names if rise_of(robot.tracks[n]) >= RULES.lift]
+        name = max(names, key=lambda n: rise_of(tracks[n]))
+        lifted = [n for n in names if rise_of(tracks[n]) >= RULES.lift]
         if lifted and any(where):
-            name = min(lifted, key=lambda n: math.dist(robot.tracks[n][-1].p_world[:2], xy))
+            name = min(lifted, key=lambda n: math.dist(tracks[n][-1].p_world[:2], xy))
         if seen is not None and not outcome.attempts:  # nothing rose: that which was looked at
-            name = min(names, key=lambda n: float(np.linalg.norm(robot.tracks[n][0].p_world - np.array(seen))))
+            name = min(names, key=lambda n: float(np.linalg.norm(tracks[n][0].p_world - np.array(seen))))
         item = task.scene.object(name)
         higher = higher_by(task.scene, item, task.place_on)
-        verdict = judge(robot.tracks[name], xy, claimed=outcome.success, corners=item.corners, higher=higher)
+        verdict = judge(tracks[name], xy, claimed=outcome.success, corners=item.corners, higher=higher)
         return Trial(task.scene, task.seed, name, outcome, verdict, steps, wall_s, end_ns)
 
-    def _rest(self, names: list[str]) -> None:
+    async def _rest(self, names: list[str]) -> None:
         end_ns = self.robot.t_ns + round(_REST_LIMIT_S * 1e9)
         least_ns = self.robot.t_ns + round(1.2 * RULES.rest * 1e9)
         while self.robot.t_ns < end_ns:
-            self.robot.tick()
+            await turn()
             if self.robot.t_ns > least_ns and all(rests(self.robot.tracks[name]) for name in names):
                 return
+
+
+def _since(track: Sequence[Sample], t_ns: int) -> Sequence[Sample]:
+    """Return the part of a track from the last sample before a moment on."""
+    return track[max(0, bisect_left(track, t_ns, key=lambda sample: sample.t_ns) - 1) :]
 
 
 def with_robot(task: Task, options: CampaignOptions, folder: Path) -> tuple[Task, Known]:

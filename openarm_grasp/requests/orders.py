@@ -25,8 +25,11 @@ from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import SAME_SPOT
 from openarm_grasp.requests.request import GraspRequest, Spot
 
-#: With these there is nothing more to ask for, whatever it is.
+#: With these there is nothing more to ask for, whatever it is; with the last, of the arm that was asked for by name.
 _OVER = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
+_WITHOUT_ARM = _OVER[1:]
+#: The arm of a request that any arm may carry out.
+_ANY_ARM = "auto"
 #: There is no more of it in view.
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 #: What is refused so may be taken where others are pushed away from it.
@@ -99,6 +102,7 @@ class Left:
         code: Why it was left.
         why: Why, in a sentence.
         after: Requests by then after which things lay, or were seen, otherwise.
+        arm: The arm that could not take it; "auto": neither could.
     """
 
     label: str
@@ -106,6 +110,7 @@ class Left:
     code: Code
     why: str
     after: int
+    arm: str = _ANY_ARM
 
     def __str__(self) -> str:
         """Sentence for the report."""
@@ -137,11 +142,13 @@ class _InVain:
 
 @dataclass
 class Order:
-    """Objects to be picked one after the other, or two at once, in rounds: of those that fit, the easiest first.
+    """Objects to be picked in rounds: of those that fit, the easiest first.
 
-    In a round everything in view is asked for once. What cannot be taken is left, and asked for in another round when
-    an arm has moved anything since: it may have been in the way, or have hidden it, or lie otherwise itself. After a
-    round in which nothing has moved, each thing that fits into a hand is asked for by where it is: what stands close to
+    In a round everything in view is asked for once. Each of several arms is asked by its name for the next object as
+    soon as it is free (list scheduling, Graham 1966), and for everything in view; all else is asked for of whichever
+    arm, when none is at work. What cannot be taken is left, and asked for in another round when an arm has moved
+    anything since: it may have been in the way, or have hidden it, or lie otherwise itself. After a round in which
+    nothing has moved, each thing that fits into a hand is asked for by where it is: what stands close to
     it may be pushed aside then. Where whatever there is is wanted, what no hand takes is pushed aside itself at last,
     since things may lie below it. The order ends when nothing is left, when nothing moves any more, or when all that
     moves does so in vain.
@@ -150,22 +157,28 @@ class Order:
         labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
         bins: Where they go; None: to free spots.
         each: Most objects of one label, or of each label; 0: all.
+        arms: Arms that work at the same time; fewer than two: one request at a time.
         placed: Labels that were placed, in order.
         left: What could not be taken.
         failed: Labels that could not be asked for, or were never there, and why.
+        running: Requests that are being carried out.
     """
 
     labels: Sequence[str]
     bins: Bins | None = None
     each: int | Mapping[str, int] = 0
+    arms: Sequence[str] = ()
     placed: list[str] = field(default_factory=list[str])
     left: list[Left] = field(default_factory=list[Left])
     failed: dict[str, str] = field(default_factory=dict[str, str])
+    running: list[GraspRequest] = field(default_factory=list[GraspRequest])
     #: Where what was placed stands, and what a hand may hold.
     _stand: list[Spot] = field(default_factory=list[Spot])
     _held: list[str] = field(default_factory=list[str])
-    #: Labels of which nothing more is in view in this round, and what the round before had left.
-    _asked: set[str] = field(default_factory=set[str])
+    #: Arms that cannot go on.
+    _stopped: set[str] = field(default_factory=set[str])
+    #: Labels of which an arm has nothing more in view in this round, and what the round before had left.
+    _asked: set[tuple[str, str]] = field(default_factory=set[tuple[str, str]])
     _before: list[Left] = field(default_factory=list[Left])
     #: Places that things were asked for by in this round.
     _by_place: list[Spot] = field(default_factory=list[Spot])
@@ -188,42 +201,48 @@ class Order:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no bin for {', '.join(homeless)}; there are bins for {known}")
 
     def next(self) -> GraspRequest | None:
-        """The next request; None when the order has ended."""
-        if self.over:
+        """The next request that may begin now; None: when one of those that run has ended, or, when none runs, never."""
+        asked = None if self.over else self._of_free_arm() or (None if self.running else self._alone())
+        self.running += [] if asked is None else [asked]
+        return asked
+
+    @property
+    def _able(self) -> list[str]:
+        return [arm for arm in self.arms if arm not in self._stopped]
+
+    def _of_free_arm(self) -> GraspRequest | None:
+        """A request for an arm that is free while the other may be at work."""
+        busy = {ask.arm for ask in self.running}
+        if len(self._able) < 2 or self._held or _ANY_ARM in busy:
             return None
+        wanted = self._wanted(*(self.label_of(ask) for ask in self.running))
+        free = ((arm, label) for arm in self._able if arm not in busy for label in wanted)
+        return next((self._easiest(label, arm) for arm, label in free if not self._exhausted(label, arm)), None)
+
+    def _alone(self) -> GraspRequest | None:
+        """A request that is carried out while no other is, by whichever arm can go on."""
+        arm = self._able[0] if self._stopped else _ANY_ARM
         if self._held:
             held = self._held[0]
-            return GraspRequest(f"{EASIEST} {held}", phase="place", place_choices=self._spots(held))
+            return GraspRequest(f"{EASIEST} {held}", arm, phase="place", place_choices=self._spots(held))
         wanted = self._wanted()
         for label in wanted:
-            if label not in self._asked:
-                return self._easiest(label)
+            if not self._exhausted(label, arm):
+                return self._easiest(label, arm)
         left = [one for one in self.left if one.label in wanted]
         if self._given_up or not left:
             return None
         if any(one.after < self._moved for one in left):
             self._before, self.left, self._asked, self._by_place = self.left, [], set(), []
-            return self.next()
+            return self._of_free_arm() or self._alone()
         stay = tuple(self._stand)
         for one in left:
             if one.where is not None and one.code in _BY_PLACE and not self._was_asked_for(one.where):
                 spots = self._spots(one.label)
-                return GraspRequest(one.label, object_at=one.where, exclude_near=stay, place_choices=spots)
+                return GraspRequest(one.label, arm, object_at=one.where, exclude_near=stay, place_choices=spots)
         for code, one in product(_IN_THE_WAY, left):
             if one.code is code and one.where is not None and self._may_push(one.label, one.where):
-                return GraspRequest(one.label, object_at=one.where, exclude_near=stay, phase="aside")
-        return None
-
-    def next_to(self, first: GraspRequest) -> GraspRequest | None:
-        """A request that another arm may carry out at the same time as the next one; None, when there is none."""
-        if first.phase != "all" or first.object_at is not None:
-            return None
-        taken = self.label_of(first)
-        for label in self._wanted(taken):
-            if label not in self._asked:
-                other = self._easiest(label)
-                # of one bin, from its other end
-                return replace(other, place_choices=other.place_choices[::-1])
+                return GraspRequest(one.label, arm, object_at=one.where, exclude_near=stay, phase="aside")
         return None
 
     def _wanted(self, *taken: str) -> list[str]:
@@ -231,10 +250,18 @@ class Order:
         labels = dict.fromkeys(self.labels)
         return [label for label in labels if label not in self.failed and not self._enough(label, *taken)]
 
-    def _easiest(self, label: str) -> GraspRequest:
+    def _exhausted(self, label: str, arm: str) -> bool:
+        """Whether an arm has nothing more of a label in view; whichever arm has not when none has."""
+        if {(label, arm), (label, _ANY_ARM)} & self._asked:
+            return True
+        return arm == _ANY_ARM and bool(self._able) and all((label, one) in self._asked for one in self._able)
+
+    def _easiest(self, label: str, arm: str) -> GraspRequest:
         """A request for any object of a label; whatever it was asked for as, what was placed or left is not meant."""
-        stay = (*self._stand, *(one.where for one in self.left if one.where is not None))
-        return GraspRequest(f"{EASIEST} {label}", exclude_near=stay, place_choices=self._spots(label))
+        left = (one.where for one in self.left if one.where is not None and one.arm in (arm, _ANY_ARM))
+        # of one bin, the last arm fills the other end
+        spots = self._spots(label)[:: -1 if arm in self.arms[1:] else 1]
+        return GraspRequest(f"{EASIEST} {label}", arm, exclude_near=(*self._stand, *left), place_choices=spots)
 
     @property
     def _given_up(self) -> bool:
@@ -299,12 +326,18 @@ class Order:
             touched: An arm has moved for it.
             held: A hand may hold it still: it is put down before anything else; one that cannot do that ends the label.
         """
-        label, after = self.label_of(request), self._moved
+        label, after, arm = self.label_of(request), self._moved, request.arm
+        if request in self.running:
+            self.running.remove(request)
         self._moved += touched or code is Code.OK
         self._in_vain.append(_InVain(request, code, touched, seen is not None))
         if request.phase == "aside" and code not in _OVER:
             return None
         self.left = [one for one in self.left if one.label != label or one.where is not None]
+        where = None if seen is None else (float(seen[0]), float(seen[1]))
+        if code in _WITHOUT_ARM and request.phase == "all" and len(self._able) > 1 and arm in self._able:
+            self._stopped.add(arm)  # the other goes on
+            return self._leave(Left(label, where, code, f"{arm} arm: {message}", after)) if touched else None
         placing = request.phase == "place"
         if placing:
             self._held = self._held[1:]
@@ -318,7 +351,6 @@ class Order:
         if (placing and held) or code in (*_OVER, Code.INVALID_ARGUMENT):
             self.failed[label] = f"{code}: {message}"
             return None
-        where = None if seen is None else (float(seen[0]), float(seen[1]))
         if request.object_at is not None:
             spot = (float(request.object_at[0]), float(request.object_at[1]))
             self._by_place += [spot, *([] if where is None else [where])]
@@ -326,15 +358,15 @@ class Order:
                 self.left = [one for one in self.left if one not in tuple(self._at(spot))]
         if where is None and code in _GONE:
             if request.object_at is None:
-                return self._none_left(label, code, message)
+                return self._none_left(label, arm, code, message)
             self._moved += self._otherwise < _UNSEEN
             return None
         unseen = self._unseen
         if self._given_up or unseen >= _UNSEEN or (where is None and not unseen):
-            self._asked.add(label)
+            self._asked.add((label, arm))
         if code in _GONE and where is not None and any(self._at(where, label)):
             return None
-        return self._leave(Left(label, where, code, message, after))
+        return self._leave(Left(label, where, code, message, after, arm))
 
     def _place(self, label: str, placed: Sequence[float], seen: Sequence[float] | None, *, placing: bool) -> None:
         """Note that an object of a label was placed; what was placed before, and is seen in pieces, was so in vain."""
@@ -346,17 +378,19 @@ class Order:
             self._stand.append((float(placed[0]), float(placed[1])))
         if again:
             if self._given_up:
-                self._asked.add(label)
+                self._asked.add((label, _ANY_ARM))
             return
+        taken = [] if seen is None else [*self._at((float(seen[0]), float(seen[1])))]  # by an arm that could
+        self.left = [one for one in self.left if one not in taken]
         self._in_vain, self._before = [], []
         self.placed.append(label)
         if self._enough(label):
             self.left = [one for one in self.left if one.label != label]
 
-    def _none_left(self, label: str, code: Code, message: str) -> Left | None:
+    def _none_left(self, label: str, arm: str, code: Code, message: str) -> Left | None:
         """Nothing more of a label is in view besides what was left; what was left before and is out of view is, too."""
-        self._asked.add(label)
-        if any(one.label == label for one in self.left):
+        self._asked.add((label, arm))
+        if not self._exhausted(label, _ANY_ARM) or any(one.label == label for one in self.left):
             return None
         gone = (one for one in self._before if one.label == label and one.where is not None)
         self.left += [replace(one, after=self._moved) for one in gone]
@@ -365,8 +399,11 @@ class Order:
         return self._leave(Left(label, None, code, message, self._moved))
 
     def _leave(self, one: Left) -> Left:
-        self.left.append(one)
-        return one
+        """Leave an object; what an arm has left that the other could not take either, neither takes."""
+        other = [] if one.where is None else [left for left in self._at(one.where, one.label) if left.arm != one.arm]
+        self.left = [left for left in self.left if left not in other]
+        self.left.append(replace(one, arm=_ANY_ARM) if other else one)
+        return self.left[-1]
 
     @property
     def over(self) -> bool:

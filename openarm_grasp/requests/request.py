@@ -84,9 +84,9 @@ class GraspRequest:
         """The request, for this object alone; it may have moved since."""
         return replace(self, label=same.target.label, same=same)
 
-    def without(self, spot: Spot) -> GraspRequest:
-        """The request, for another object than that at (x, y), base frame, m."""
-        return replace(self, exclude_near=(*self.exclude_near, spot))
+    def without(self, *spots: Spot) -> GraspRequest:
+        """The request, for another object than those at (x, y), base frame, m."""
+        return replace(self, exclude_near=(*self.exclude_near, *spots))
 
     def find(self, frames: Sequence[Frame], limits: DetectConfig) -> Sighting:
         """The object in frames of the base frame; errors as `perception.detections.find`."""

@@ -30,6 +30,7 @@ from openarm_grasp.requests.states import State
 
 if TYPE_CHECKING:
     from openarm_grasp.robot.skills import Skills
+    from openarm_grasp.strategies.run import Run
 
 #: Objects whose places are remembered.
 _REMEMBERED = 50
@@ -112,6 +113,8 @@ class GraspSession:
         self.drift = DriftWatch(context.config.drift, context.config.camera)
         #: What hands kept when their requests ended, by arm.
         self.kept: dict[str, Grasp] = {}
+        #: Requests that are being carried out.
+        self.runs: list[Run] = []
         #: (x, y) of the newest objects that were placed, and their ids.
         self._placed: list[tuple[Array, str]] = []
 
@@ -129,6 +132,13 @@ class GraspSession:
         """Return the ids of what was placed at positions, of those where that is known."""
         return {spot: name for spot in spots for p, name in self._placed if math.dist(p, spot) < SAME_SPOT}
 
+    def beside(self, run: Run, request: GraspRequest) -> GraspRequest:
+        """Return a request for what no other request is at: neither where it takes it nor where it puts it."""
+        ends = [
+            spot for r in self.runs if r is not run for spot in (r.seen_at, r.place_target and r.place_target.position)
+        ]
+        return request.without(*((float(p[0]), float(p[1])) for p in ends if p is not None))
+
     def check_hands(self, robot: Skills, request: GraspRequest) -> None:
         """Refuse what would drop an object that an ended request left in a hand; forget one that is gone.
 
@@ -140,7 +150,7 @@ class GraspSession:
         for arm, kept in list(self.kept.items()):
             if not self.partly_open(robot, arm):
                 del self.kept[arm]  # taken or dropped meanwhile
-            elif request.phase != "place":
+            elif request.phase != "place" and request.arm in ("", "auto", arm):
                 label, aperture = kept.sighting.target.label, robot.aperture(arm)
                 raise OpenArmError(
                     Code.NOT_READY,

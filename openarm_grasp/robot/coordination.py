@@ -3,12 +3,14 @@
 
 That two arms in motion keep their clearance is validated by motion, which delays the later one. What is left is an arm
 at rest in the way: the other waits until it has gone on. Of two that wait for each other, the one that comes second in
-the order of arms gives up, and goes home as after every failure. Base frame, m, rad.
+the order of arms gives up, and goes home as after every failure. An arm at work is left alone; another may be sent
+home. Base frame, m, rad.
 """
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Generator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
@@ -19,6 +21,7 @@ from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
+from openarm_grasp.robot.skills import Skills
 
 T = TypeVar("T")
 
@@ -31,18 +34,37 @@ class ArmCoordination:
     """What the robots of both arms share.
 
     Attributes:
+        at_work: What each arm is at work on, by arm; others rest.
         waiting: Arms that wait until the other goes on.
         observing: The arm that observes; "" when none does.
-        done: Arms whose work has ended.
+        sent_home: The arm at rest that the other sends home; "" when none is.
     """
 
+    at_work: dict[str, str] = field(default_factory=dict[str, str])
     waiting: set[str] = field(default_factory=set[str])
     observing: str = ""
-    done: set[str] = field(default_factory=set[str])
+    sent_home: str = ""
+
+    @contextmanager
+    def taking(self, arms: Sequence[str], what: str) -> Generator[None, None, None]:
+        """Let arms be at work on something for as long as this is open.
+
+        Raises:
+            OpenArmError: BUSY, naming what one of them is at work on.
+        """
+        if busy := {self.at_work[arm]: None for arm in arms if arm in self.at_work}:
+            text = f"{' and '.join(busy)} is running; cancel it or wait until it has ended"
+            raise OpenArmError(Code.BUSY, text)
+        self.at_work.update(dict.fromkeys(arms, what))
+        try:
+            yield
+        finally:
+            for arm in arms:
+                self.at_work.pop(arm, None)
 
 
 class CoordinatedRobot:
-    """Implements the robot's interface for one arm while the other works, too; use `coordinated`.
+    """Implements the robot's interface for one request of one arm while the other may work, too; use `coordinated`.
 
     Args:
         arm: Which.
@@ -57,6 +79,7 @@ class CoordinatedRobot:
         self._other = next(name for name in robot.description.arm_names if name != arm)
         self._homes = {a: robot.description.group_state(f"{a}_arm", config.home_state) for a in (arm, self._other)}
         self.deadline_ns, self.velocity_scale = 0, robot.velocity_scale
+        self._observed = False
 
     def __getattr__(self, name: str) -> Any:
         """What is the same for an arm alone."""
@@ -75,11 +98,12 @@ class CoordinatedRobot:
     async def observe(self, count: int, *, near: str = "") -> Frames:
         """Frames that are taken from now on.
 
-        An arm that observes from home (what it is to grasp, or has placed) waits until the other one hides nothing any
-        more; one that is at work does not.
+        The first are taken at once: what the other arm hides may not be needed. An arm that observes from home again
+        waits until the other one hides nothing any more; one that is on its way does not.
         """
         coordination, limit = self._coordination, self._config.limits.beside_timeout
-        if not near and self._is_home(self.arm):
+        again, self._observed = self._observed, self._observed or not near
+        if again and not near and self._is_home(self.arm):
             await self._robot.until(self._other_is_away, limit, f"observing: the {self._other} arm is in the view")
         await self._robot.until(
             lambda: coordination.observing in ("", self.arm), limit, "observing: the other arm observes"
@@ -112,8 +136,22 @@ class CoordinatedRobot:
     async def move(
         self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
     ) -> None:
-        """Move an arm to a named posture, or its TCP to a pose."""
-        await self._patiently(lambda: self._robot.move(arm, to, what, obstacles, plan_only=plan_only), what)
+        """Move an arm to a named posture, or its TCP to a pose; the other arm only when it rests, and as far as it can."""
+        coordination, work = self._coordination, lambda: self._robot.move(arm, to, what, obstacles, plan_only=plan_only)
+        if arm != self._other:
+            await self._robot.until(lambda: coordination.sent_home != arm, self._config.limits.beside_timeout, what)
+            await self._patiently(work, what)
+            return
+        if arm in coordination.at_work:
+            return
+        coordination.sent_home = arm
+        try:
+            await work()
+        except OpenArmError as error:
+            self.check()
+            self.warn(f"{error.message}; the {arm} arm stays where it is")
+        finally:
+            coordination.sent_home = ""
 
     # --- the other arm
     async def _patiently(self, work: Callable[[], Awaitable[T]], what: str) -> T:
@@ -157,9 +195,9 @@ class CoordinatedRobot:
         return self._robot.description.away(self._homes[arm], q) <= self._config.home_tolerance
 
     def _other_is_away(self) -> bool:
-        return self._other in self._coordination.done or self._is_home(self._other)
+        return self._other not in self._coordination.at_work or self._is_home(self._other)
 
 
-def coordinated(arm: str, robot: RobotInterface, coordination: ArmCoordination, config: GraspConfig) -> RobotInterface:
-    """The robot for one arm while the other works, too; arguments as of `CoordinatedRobot`."""
-    return cast("RobotInterface", CoordinatedRobot(arm, robot, coordination, config))
+def coordinated(arm: str, robot: RobotInterface, coordination: ArmCoordination, config: GraspConfig) -> Skills:
+    """The skills of a robot for a request of one arm, `CoordinatedRobot`."""
+    return Skills(cast("RobotInterface", CoordinatedRobot(arm, robot, coordination, config)), config)

@@ -54,17 +54,11 @@ class Skills:
     Args:
         robot: Interface to it.
         config: Parameters.
-        arms: Those that may be sent home; none named: all.
-        ids: Ids of objects of detectors that give none; None: those of a new robot.
     """
 
-    def __init__(
-        self, robot: RobotInterface, config: GraspConfig, *, arms: Sequence[str] = (), ids: Ids | None = None
-    ) -> None:
+    def __init__(self, robot: RobotInterface, config: GraspConfig) -> None:
         self.robot = robot
         self._config = config
-        self._arms = frozenset(arms or robot.description.arm_names)
-        self.ids, self._near_ids = ids or Ids(config.detect.match_radius), Ids(config.detect.match_radius)
         self._hands = {arm: HandReader(robot.description, robot.states, arm) for arm in robot.description.arm_names}
 
     @property
@@ -395,8 +389,6 @@ class Skills:
         config, robot = self._config, self.robot
         robot.check()
         for arm in arms:
-            if arm not in self._arms:
-                continue
             if self.away_from_home(arm) <= config.home_tolerance:
                 continue
             T_base_tcp = self._hands[arm].T_base_tcp()

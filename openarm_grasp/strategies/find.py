@@ -14,7 +14,7 @@ import numpy as np
 from openarm_common.detection import Detection, gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.hand import HandParts
-from openarm_common.wanted import describe
+from openarm_common.wanted import EASIEST, describe
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import (
     NEXT_TO,
@@ -27,12 +27,13 @@ from openarm_grasp.perception.detections import (
 )
 from openarm_grasp.perception.sightings import object_points
 from openarm_grasp.planning import retries
-from openarm_grasp.planning.arms import out_of_reach
+from openarm_grasp.planning.arms import out_of_reach, sides
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, little_turns, shorter
 from openarm_grasp.planning.neighbours import crowded, standing_boxes
 from openarm_grasp.planning.options import NO_WAY, NoWayError, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, spots_on
 from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
+from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import Grasp
 from openarm_grasp.robot.interface import Frames, Planned
@@ -137,7 +138,7 @@ async def _clear_view(run: Run) -> None:
     """
     if run.request.dry_run or run.request.confirm or run.missed > 0 or run.plans_failed > 0:
         return
-    kept, robot = run.task.session.kept if run.kept is not None else {}, run.robot
+    kept, robot = run.task.session.kept, run.robot
     # A hand that holds something stays where it is; it may be among the objects.
     below = run.context.clear_of_objects if run.kept is None else -inf
     for arm in (arm for arm in robot.description.arm_names if arm not in kept):
@@ -155,7 +156,7 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
     Raises:
         OpenArmError: One of `_NOT_TRUSTED`, when it cannot be trusted.
     """
-    request, limits, top_z, kept = run.request, run.config.detect, run.context.table.top_z, run.kept
+    limits, top_z, kept = run.config.detect, run.context.table.top_z, run.kept
     if kept is not None:
         newest, target = frames[-1], kept.sighting.target
         hand = run.robot.T_base_tcp(kept.arm)[:2, 3]
@@ -165,7 +166,7 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
         sighting = replace(kept.sighting, others=_standing(others, top_z), t_ns=newest.t_ns)
     else:
         try:
-            found = request.find(frames, limits)
+            found = _beside_others(run).find(frames, limits)
         except UntrustedError as error:
             run.seen_at = error.where
             raise
@@ -180,6 +181,18 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
     if kept or run.size is None or any(d.label == sighting.target.label for d in sighting.others):
         run.size = sighting.target.size
     return sighting
+
+
+def _beside_others(run: Run) -> GraspRequest:
+    """The request, for what no other one is at; of the easiest, an arm by name takes the outermost on its side first.
+
+    Two arms come together last so, when either may take what is left.
+    """
+    request, shoulders = run.task.session.beside(run, run.request), run.context.shoulders
+    side = sides(request.arm, shoulders) if request.arm in shoulders else ()
+    if len(side) != 1 or not request.label.startswith(EASIEST):
+        return request
+    return replace(request, label=f"{'leftmost' if side[0] > 0.0 else 'rightmost'} {request.label}")
 
 
 def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ...]:

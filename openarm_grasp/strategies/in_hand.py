@@ -32,7 +32,7 @@ _ABOVE = 0.7
 
 
 async def take_up(session: GraspSession, robot: Skills, *requests: GraspRequest) -> None:
-    """Let the session keep what hands hold that it does not know of; costs time only where fingers are partly open.
+    """Let the session keep what the hands of requests hold that it does not know of; partly open fingers take time.
 
     Raises:
         OpenArmError: NOT_READY, when a hand holds what nothing is known of: no request may open it.
@@ -40,8 +40,9 @@ async def take_up(session: GraspSession, robot: Skills, *requests: GraspRequest)
     if all(request.dry_run and request.phase != "place" for request in requests):
         return
     unknown: list[str] = []
+    named = {request.arm or "auto" for request in requests}
     for arm in robot.description.arm_names:
-        if arm in session.kept or not session.partly_open(robot, arm):
+        if not named & {"auto", arm} or arm in session.kept or not session.partly_open(robot, arm):
             continue
         config = session.context.config
         evidence = await robot.measure(arm, 0.0, settle=config.timing.settle_limit)

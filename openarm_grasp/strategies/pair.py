@@ -128,16 +128,14 @@ async def simultaneous(pair: Pair) -> PairOutcome | None:
 
     async def work(i: int) -> None:
         arm = arms[i]
-        own = coordinated(arm, pair.robots[arm], coordination, config)
-        robot = Skills(own, config, arms=(arm,), ids=pair.robot.ids)
-        try:
-            task = pair.task(i, robot, arm=arm, why=pair.reason)
-            outcome = await pick_and_place(task, task.request)
-            outcomes[i] = replace(outcome, route="direct" if outcome.success else "")
-        except OpenArmError as error:
-            outcomes[i] = GraspOutcome(error.code, error.message, pair.requests[i].label)
-        finally:
-            coordination.done.add(arm)
+        robot = coordinated(arm, pair.robots[arm], coordination, config)
+        with coordination.taking((arm,), pair.requests[i].label):
+            try:
+                task = pair.task(i, robot, arm=arm, why=pair.reason)
+                outcome = await pick_and_place(task, task.request)
+                outcomes[i] = replace(outcome, route="direct" if outcome.success else "")
+            except OpenArmError as error:
+                outcomes[i] = GraspOutcome(error.code, error.message, pair.requests[i].label)
 
     await pair.robot.robot.together([lambda: work(0), lambda: work(1)])
     for i, outcome in sorted(outcomes.items()):

@@ -65,6 +65,7 @@ class Run:
         #: How to put it down, confirmed with the grasp.
         self.place_plan: Planned | None = None
         self.hand = Hand.CARRYING if kept else Hand.FREE
+        task.session.runs.append(self)
 
     @property
     def label(self) -> str:
@@ -163,6 +164,10 @@ class Run:
         Raises:
             OpenArmError: INTERNAL, when it may not end in this state.
         """
+        runs, (x, y, _) = self.task.session.runs, outcome.place_position
+        runs.remove(self)
+        for other in runs if outcome.success else ():  # what was placed meanwhile it does not take
+            other.request = other.request.without((x, y))
         check_transition(self.state, State.IDLE)
         text, task = outcome.message, self.task
         about = Status(State.IDLE, self.state, text, label=outcome.label, arm=outcome.arm, request=task.index)

@@ -28,6 +28,8 @@ class Robot:
             self.q |= self.description.group_state(f"{arm}_arm", config.home_state)
         self.on_step: Callable[[int], None] = lambda step: None
         self.faults: list[Code] = []
+        self.moves: list[str] = []
+        self.warnings: list[str] = []
 
     def latest(self) -> tuple[int, dict[str, float]]:
         return self.now_ns, self.q
@@ -49,6 +51,16 @@ class Robot:
             raise OpenArmError(self.faults.pop(0), "the other arm is in the way")
         return "plan"
 
+    async def move(self, arm: str, to: object, *_: object, **__: object) -> None:
+        await self.plan(to)
+        self.moves.append(arm)
+
+    def check(self) -> None:
+        pass
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
     async def observe(self, count: int, *, near: str = "") -> str:
         self.looks += 1
         return "frames"
@@ -66,7 +78,8 @@ def run(work: Coroutine[Any, Any, Any]) -> Any:
 
 
 def link(robot: Robot, arm: Any, coordination: ArmCoordination | None = None) -> CoordinatedRobot:
-    return CoordinatedRobot(arm, robot, coordination or ArmCoordination(), GraspConfig())  # type: ignore[arg-type]
+    both = coordination or ArmCoordination(dict.fromkeys(("left", "right"), "a grasp"))
+    return CoordinatedRobot(arm, robot, both, GraspConfig())  # type: ignore[arg-type]
 
 
 def test_an_arm_waits_until_the_other_has_gone_on_and_plans_again() -> None:
@@ -90,11 +103,11 @@ def test_what_is_not_the_other_arms_doing_is_reported_at_once() -> None:
 
 
 def test_of_two_arms_that_wait_for_each_other_the_right_one_gives_way() -> None:
-    robot, coordination = Robot(), ArmCoordination(waiting={"left"})
+    robot, coordination = Robot(), ArmCoordination({"left": "a grasp"}, {"left"})
     robot.away("left")
     robot.faults = [Code.IN_COLLISION]
     refused("in the way", run, link(robot, "right", coordination).plan(None))  # type: ignore[arg-type]
-    robot, coordination = Robot(), ArmCoordination(waiting={"right"})
+    robot, coordination = Robot(), ArmCoordination({"right": "a grasp"}, {"right"})
     robot.away("right")
     robot.faults = [Code.IN_COLLISION]
     robot.on_step = lambda step: robot.away("right", -0.5) if step == 2 else None
@@ -102,20 +115,57 @@ def test_of_two_arms_that_wait_for_each_other_the_right_one_gives_way() -> None:
     assert coordination.waiting == {"right"}
 
 
-def test_an_arm_at_home_looks_when_the_other_hides_nothing_and_one_at_work_does_not_wait() -> None:
+def test_an_arm_looks_at_once_and_from_home_again_when_the_other_hides_nothing() -> None:
     robot = Robot()
     robot.away("right")
     robot.on_step = lambda step: robot.away("right", -0.5) if step == 4 else None
-    run(link(robot, "left").observe(3))
-    assert (robot.steps, robot.looks) == (4, 1)
-    robot.away("right")
-    robot.away("left")
-    run(link(robot, "left").observe(3))
+    left = link(robot, "left")
+    run(left.observe(3))
+    assert (robot.steps, robot.looks) == (0, 1)
+    run(left.observe(3))
     assert (robot.steps, robot.looks) == (4, 2)
+    robot.away("right")
+    robot.away("left")  # on its way
+    run(left.observe(3))
+    assert (robot.steps, robot.looks) == (4, 3)
 
 
-def test_an_arm_whose_work_is_done_hides_nothing() -> None:
+def test_an_arm_that_is_not_at_work_hides_nothing_that_it_would_be_waited_for() -> None:
     robot = Robot()
     robot.away("right")
-    run(link(robot, "left", ArmCoordination(done={"right"})).observe(3))
-    assert robot.looks == 1
+    left = link(robot, "left", ArmCoordination({"left": "a grasp"}))
+    for _ in range(2):
+        run(left.observe(3))
+    assert (robot.steps, robot.looks) == (0, 2)
+
+
+def test_an_arm_at_work_is_never_sent_home_by_the_other_and_one_at_rest_as_far_as_it_can() -> None:
+    robot, coordination = Robot(), ArmCoordination({"left": "a grasp", "right": "a grasp"})
+    left = link(robot, "left", coordination)
+    run(left.move("right", "home", "go home"))
+    assert robot.moves == []
+    del coordination.at_work["right"]
+    run(left.move("right", "home", "go home"))
+    assert robot.moves == ["right"]
+    robot.faults = [Code.STOPPED]
+    run(left.move("right", "home", "go home"))
+    assert robot.warnings == ["left arm: the other arm is in the way; the right arm stays where it is"]
+    assert coordination.sent_home == ""
+
+
+def test_an_arm_that_is_sent_home_begins_its_own_work_afterwards() -> None:
+    robot, coordination = Robot(), ArmCoordination({"left": "a grasp", "right": "a grasp"}, sent_home="right")
+    robot.on_step = lambda step: setattr(coordination, "sent_home", "" if step == 3 else "right")
+    run(link(robot, "right", coordination).move("right", "home", "go home"))
+    assert (robot.steps, robot.moves) == (3, ["right"])
+
+
+def test_arms_that_are_taken_are_busy_and_the_refusal_names_what_they_are_at() -> None:
+    coordination = ArmCoordination()
+    with coordination.taking(("left",), "a grasp of 'red'"):
+        with coordination.taking(("right",), "a grasp of 'blue'"):
+            for arms in (("left",), ("left", "right")):
+                error = refused("a grasp of 'red'.* is running; cancel it", coordination.taking(arms, "x").__enter__)
+                assert error.code is Code.BUSY
+        assert list(coordination.at_work) == ["left"]
+    assert not coordination.at_work

@@ -85,7 +85,7 @@ class Fingers:
 
     def skills(self, **learned: HandReach) -> Skills:
         self.description = self.description.with_hands(learned)
-        return Skills(cast("RobotInterface", self), CONFIG, arms=("right",))
+        return Skills(cast("RobotInterface", self), CONFIG)
 
 
 def run(work: Coroutine[Any, Any, Any]) -> Any:

@@ -19,6 +19,13 @@ BINS = Bins(
 )
 
 
+def peek(order: Order) -> GraspRequest | None:
+    """The next request, which is not begun."""
+    ask = order.next()
+    order.running = [one for one in order.running if one is not ask]
+    return ask
+
+
 def carry_out(
     order: Order, codes: dict[str, Code] | None = None, table: dict[str, int] | None = None
 ) -> list[GraspRequest]:
@@ -160,7 +167,7 @@ def test_a_hand_that_cannot_let_go_ends_the_order(order):
 def test_what_was_let_go_elsewhere_is_asked_for_again(order):
     order.done(order.next(), Code.GRASP_LOST, "it has turned", seen=(0.3, 0.0), touched=True, held=True)
     order.done(order.next(), Code.PLACE_FAILED, "let go where it met something", seen=(0.2, 0.1), touched=True)
-    assert order.next() == GraspRequest("easiest anything", exclude_near=((0.3, 0.0), (0.2, 0.1)))
+    assert peek(order) == GraspRequest("easiest anything", exclude_near=((0.3, 0.0), (0.2, 0.1)))
 
 
 def test_a_camera_that_shows_nothing_is_asked_again_three_times_at_most():
@@ -229,10 +236,11 @@ def test_a_full_bin_is_the_reason_for_what_is_left():
     order = Order(("red",), BINS)
     order.done(order.next(), Code.OK, "", (0.2, 0.2, 0.4), (0.3, 0.0, 0.42))
     order.done(order.next(), Code.PLACE_FAILED, "none of 2 places is free", seen=(0.3, 0.1, 0.42))
-    assert order.next() == GraspRequest(
+    last = order.next()
+    assert last == GraspRequest(
         "easiest red", exclude_near=((0.2, 0.2), (0.3, 0.1)), place_choices=BINS.bins["left"].slots(BINS.spacing)
     )
-    order.done(order.next(), Code.UNKNOWN_OBJECT, "no more")
+    order.done(last, Code.UNKNOWN_OBJECT, "no more")
     assert order.next() is None
     assert order.faults() == ("red at (0.300, 0.100) m: PLACE_FAILED: none of 2 places is free",)
 
@@ -250,9 +258,9 @@ def test_orders_and_bins_that_make_no_sense_are_refused(tmp_path):
 def test_what_others_block_is_asked_for_again_when_they_are_gone():
     order = Order(("red", "blue"), each=1)
     order.done(order.next(), Code.IN_COLLISION, "blue is in the way")
-    assert order.next() == GraspRequest("easiest blue")
+    assert peek(order) == GraspRequest("easiest blue")
     order.done(order.next(), Code.OK, "")
-    assert order.next() == GraspRequest("easiest red")
+    assert peek(order) == GraspRequest("easiest red")
     order.done(order.next(), Code.OK, "")
     assert order.next() is None
     assert order.outcome == "SUCCESS"
@@ -269,7 +277,7 @@ def test_what_stays_blocked_failed_with_its_reason():
 def test_what_an_order_has_placed_it_does_not_pick_again():
     order = Order(("red",), each={"red": 2})
     order.done(order.next(), Code.OK, "", (0.3, -0.2, 0.4))
-    assert order.next() == GraspRequest("easiest red", exclude_near=((0.3, -0.2),))
+    assert peek(order) == GraspRequest("easiest red", exclude_near=((0.3, -0.2),))
     order.done(order.next(), Code.OK, "", (0.2, -0.2, 0.4))
     assert order.next() is None
     assert order.outcome == "SUCCESS"
@@ -279,7 +287,7 @@ def test_what_an_order_has_placed_it_does_not_pick_again():
 def test_what_was_placed_is_not_asked_for_again_by_another_word():
     order = Order(("cola", "can"), each=1)
     order.done(order.next(), Code.OK, "", (0.3, 0.2, 0.4))
-    assert order.next() == GraspRequest("easiest can", exclude_near=((0.3, 0.2),))
+    assert peek(order) == GraspRequest("easiest can", exclude_near=((0.3, 0.2),))
 
 
 @pytest.mark.requirement("R-17")
@@ -292,7 +300,7 @@ def test_what_was_placed_and_is_taken_again_by_a_piece_of_it_counts_once_and_doe
         to = (0.3, 0.2 + 0.1 * (n % 2))
         order.done(ask, Code.OK, "", to, at, touched=True)
         at = to
-        assert order.next() is None or order.next().exclude_near == (at,)
+        assert (ask := peek(order)) is None or ask.exclude_near == (at,)
     assert order.next() is None
     assert (order.placed, order.outcome) == (["anything"], "SUCCESS")
 
@@ -357,7 +365,7 @@ def test_what_a_push_has_moved_out_of_sight_does_not_end_an_order(order):
     ask = order.next()
     assert ask.object_at == (0.2, 0.1)
     order.done(ask, Code.UNKNOWN_OBJECT, "not there after the push", touched=True)
-    assert order.next() == GraspRequest("easiest anything")
+    assert peek(order) == GraspRequest("easiest anything")
 
 
 @pytest.mark.requirement("R-17")
@@ -368,7 +376,7 @@ def test_what_is_not_at_its_place_may_be_a_part_of_something_that_is_seen_whole_
     ask = order.next()
     assert ask.object_at == (0.43, 0.06)
     order.done(ask, Code.UNKNOWN_OBJECT, "it is seen at (0.36, 0.07)")
-    assert order.next() == GraspRequest("easiest anything")
+    assert peek(order) == GraspRequest("easiest anything")
     while ask := order.next():
         asked += 1
         assert asked < 10
@@ -381,9 +389,9 @@ def test_what_is_seen_for_a_moment_does_not_keep_for_good_from_what_it_is_a_part
     order.done(order.next(), Code.IN_COLLISION, "no room", seen=(0.30, 0.08, 0.4))
     order.done(order.next(), Code.OK, "", placed=(0.3, 1.0), seen=(0.33, -0.1, 0.4))
     order.done(order.next(), Code.UNKNOWN_OBJECT, "not there at the second look", seen=(0.40, 0.18, 0.4))
-    assert order.next().exclude_near == ((0.3, 1.0), (0.30, 0.08), (0.40, 0.18))
+    assert peek(order).exclude_near == ((0.3, 1.0), (0.30, 0.08), (0.40, 0.18))
     order.done(order.next(), Code.UNKNOWN_OBJECT, "no more")
-    assert order.next().exclude_near == ((0.3, 1.0),)  # what has no room any more may have it now
+    assert peek(order).exclude_near == ((0.3, 1.0),)  # what has no room any more may have it now
     order.done(order.next(), Code.IN_COLLISION, "no room", seen=(0.30, 0.08, 0.4))
     order.done(order.next(), Code.UNKNOWN_OBJECT, "not there at the second look", seen=(0.40, 0.18, 0.4))
     order.done(order.next(), Code.UNKNOWN_OBJECT, "no more")
@@ -397,32 +405,3 @@ def test_what_is_seen_for_a_moment_does_not_keep_for_good_from_what_it_is_a_part
         ((0.30, 0.08), Code.IN_COLLISION),
         ((0.40, 0.18), Code.UNKNOWN_OBJECT),
     ]
-
-
-def test_another_arm_takes_another_object_at_the_same_time() -> None:
-    bins = Bins(bins={"all": Bin(x=(0.2, 0.3), y=(-0.3, 0.3))}, rest="all")
-    order = Order(("anything",), bins)
-    first = order.next()
-    assert first is not None
-    other = order.next_to(first)
-    assert other == replace(first, place_choices=first.place_choices[::-1])
-    order.done(first, Code.PLACE_FAILED, "the hand keeps it", seen=(0.3, 0.0), touched=True, held=True)
-    order.done(first, Code.PLACE_FAILED, "so does the other", seen=(0.3, 0.2), touched=True, held=True)
-    for _ in range(2):  # both hands put down what they hold, one after the other
-        placing = order.next()
-        assert placing is not None
-        assert placing.phase == "place"
-        assert order.next_to(placing) is None
-        order.done(placing, Code.OK, "", placed=(0.2, 0.1))
-    assert order.next() is not None
-
-
-def test_no_more_objects_are_taken_at_once_than_are_wanted() -> None:
-    order = Order(("red", "blue"), each=1)
-    first = order.next()
-    assert first == GraspRequest("easiest red")
-    assert order.next_to(first) == GraspRequest("easiest blue")
-    order.done(first, Code.OK, "", placed=(0.2, 0.1))
-    last = order.next()
-    assert last is not None
-    assert order.next_to(last) is None
