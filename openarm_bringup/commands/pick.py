@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
+
+#: Requests of an order that are cancelled are asked to stop again after this, s.
+_CANCEL_S = 0.2
 
 
 def pick(
@@ -217,19 +221,11 @@ def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
     return Outcome(result.success, result.message, result.code, data, text + _kept(result.recording))
 
 
-def _answers(
-    client: GraspClient, asked: tuple[GraspRequest, ...], speed: float, timeout: float
-) -> Sequence[GraspResult]:
-    """Return what came of one request, or of each of two."""
-    if len(asked) == 2:
-        from openarm_grasp.ros.client import GraspResult
-
-        both = client.pick_two(*asked, speed=speed, timeout=timeout)
-        none = (both.code, both.message, both.outcome)
-        return both.results or [GraspResult(False, *none, ask.label, "", 0, (0.0, 0.0, 0.0), 0.0) for ask in asked]
-    (ask,) = asked
-    result = client.pick(
+def _answer(client: GraspClient, ask: GraspRequest, speed: float, timeout: float) -> GraspResult:
+    """Return what came of a request of an order."""
+    return client.pick(
         ask.label,
+        arm=ask.arm,
         phase=ask.phase,
         object_at=ask.object_at,
         exclude_near=ask.exclude_near,
@@ -237,7 +233,6 @@ def _answers(
         speed=speed,
         timeout=timeout,
     )
-    return (result,)
 
 
 def order(
@@ -250,7 +245,7 @@ def order(
 ) -> Outcome:
     """Pick several objects of the running graph and place them, until nothing is left or nothing can be done.
 
-    Both arms work at once where there is room for both.
+    Of several arms each takes the next object as soon as it is free.
 
     `openarm order anything` clears the table, `openarm order red` takes all that is red; the easiest comes first. What
     cannot be taken is tried again when something else has been taken away, and listed at the end with the reason. With
@@ -269,26 +264,33 @@ def order(
     from openarm_common.robot.description import RobotDescription
     from openarm_grasp.ros.client import GraspClient
 
-    work = Order(labels, load_bins(bins) if bins is not None else None, each)
-    both = len(RobotDescription.load().arm_names) > 1
+    arms = RobotDescription.load().arm_names
+    work = Order(labels, load_bins(bins) if bins is not None else None, each, arms)
     shown, results = console(), list[dict[str, Any]]()
-    with requires_node("grasp", "sim"), GraspClient() as client:
-        while first := work.next():
-            other = work.next_to(first) if both else None
-            asked = (first,) if other is None else (first, other)
-            try:
-                answers = _answers(client, asked, speed, timeout)
-            except KeyboardInterrupt:
-                data = {"placed": work.placed, "results": results}
-                return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, data)
-            for ask, result in zip(asked, answers, strict=True):
-                seen = result.object_position
-                how = {"touched": result.attempts > 0, "held": result.outcome == "PARTIAL"}
-                work.done(ask, result.code, result.message, result.place_position, seen, **how)
-                row = {"label": ask.label, "position": seen and list(seen), "code": result.code}
-                place = list(result.place_position) if result.success else None
-                results.append({**row, "message": result.message, "place": place})
-                shown.print(f"{ask.label}: {result.code}: {result.message}", markup=False)
+    running: dict[Future[GraspResult], GraspRequest] = {}
+    with requires_node("grasp", "sim"), GraspClient() as client, ThreadPoolExecutor(len(arms)) as pool:
+        try:
+            while True:
+                while (ask := work.next()) is not None:
+                    running[pool.submit(_answer, client, ask, speed, timeout)] = ask
+                if not running:
+                    break
+                for answer in wait(running, return_when=FIRST_COMPLETED).done:
+                    ask, result = running.pop(answer), answer.result()
+                    seen = result.object_position
+                    how = {"touched": result.attempts > 0, "held": result.outcome == "PARTIAL"}
+                    work.done(ask, result.code, result.message, result.place_position, seen, **how)
+                    row = {"label": ask.label, "position": seen and list(seen), "code": result.code}
+                    place = list(result.place_position) if result.success else None
+                    results.append({**row, "message": result.message, "place": place})
+                    shown.print(f"{ask.label}: {result.code}: {result.message}", markup=False)
+        except BaseException as error:
+            while running and wait(running, _CANCEL_S).not_done:  # one that was just begun, too
+                client.cancel()
+            if not isinstance(error, KeyboardInterrupt):
+                raise
+            data = {"placed": work.placed, "results": results}
+            return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, data)
     faults = work.faults()
     left = [{**asdict(one), "code": str(one.code)} for one in work.left]
     data = {"outcome": work.outcome, "placed": work.placed, "left": left, "faults": list(faults), "results": results}

@@ -201,7 +201,7 @@ class Order:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no bin for {', '.join(homeless)}; there are bins for {known}")
 
     def next(self) -> GraspRequest | None:
-        """The next request that may begin now; None: when one of those that run has ended, or, when none runs, never."""
+        """The next request that may begin now; None: not before another has ended, or, when none runs, never."""
         asked = None if self.over else self._of_free_arm() or (None if self.running else self._alone())
         self.running += [] if asked is None else [asked]
         return asked

@@ -136,8 +136,12 @@ class CoordinatedRobot:
     async def move(
         self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
     ) -> None:
-        """Move an arm to a named posture, or its TCP to a pose; the other arm only when it rests, and as far as it can."""
-        coordination, work = self._coordination, lambda: self._robot.move(arm, to, what, obstacles, plan_only=plan_only)
+        """Move an arm to a named posture, or its TCP to a pose; the other arm only when it rests, if it can."""
+        coordination = self._coordination
+
+        async def work() -> None:
+            await self._robot.move(arm, to, what, obstacles, plan_only=plan_only)
+
         if arm != self._other:
             await self._robot.until(lambda: coordination.sent_home != arm, self._config.limits.beside_timeout, what)
             await self._patiently(work, what)

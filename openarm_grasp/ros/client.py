@@ -87,7 +87,7 @@ class PairResult(Answer):
 
 
 class GraspClient(BackgroundNode):
-    """Asks the grasp node; a context manager.
+    """Asks the grasp node, also from several threads; a context manager.
 
     It brings its own ROS context, node and background thread, so it also works next to an rclpy program.
 
@@ -100,7 +100,7 @@ class GraspClient(BackgroundNode):
 
     def __init__(self, *, timeout: float = 10.0) -> None:
         super().__init__("grasp_client", timeout=timeout)
-        self._stop = threading.Event()
+        self._stops: set[threading.Event] = set()
 
     def pick(
         self,
@@ -218,8 +218,9 @@ class GraspClient(BackgroundNode):
         return PairResult(**_same(answer, "simultaneous", "recording"), results=results)
 
     def cancel(self) -> None:
-        """Ask what runs to stop; it returns with CANCELLED, the arms holding where they are."""
-        self._stop.set()
+        """Ask all that runs to stop; it returns with CANCELLED, the arms holding where they are. From any thread."""
+        for stop in tuple(self._stops):
+            stop.set()
 
     def _ask(
         self,
@@ -231,7 +232,7 @@ class GraspClient(BackgroundNode):
         confirm: OnPlan | bool = False,
     ) -> Any:
         """Send a goal and return its result message."""
-        self._stop.clear()
+        stop = threading.Event()
         plans: queue.SimpleQueue[GraspStatus] = queue.SimpleQueue()
 
         def deliver(feedback: Any) -> None:
@@ -245,7 +246,11 @@ class GraspClient(BackgroundNode):
                 plan = plans.get()
                 self.confirm(plan.plan_id, accept=confirm(plan))
 
-        return self.do(kind, name, goal, timeout=timeout, on_feedback=deliver, stop=self._stop, meanwhile=answer)
+        self._stops.add(stop)
+        try:
+            return self.do(kind, name, goal, timeout=timeout, on_feedback=deliver, stop=stop, meanwhile=answer)
+        finally:
+            self._stops.discard(stop)
 
 
 def _answer(message: ConfirmPlan.Response | ReleaseHand.Response) -> Answer:

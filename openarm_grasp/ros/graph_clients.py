@@ -78,21 +78,21 @@ class GraphClients:
         self._timer = node.create_timer(_TICK_S, self._on_tick, clock=node.steady_clock)
         self._timer.cancel()
         self._silence = Silence(_STARVED_S)
-        self._cancelled = self._active = False
+        self._active = False
 
     # --- begin, end, cancel
     async def begin(self, missing: Callable[[], list[str]]) -> None:
         """Listen to the robot and wait until nothing is missing any more.
 
         Raises:
-            OpenArmError: NOT_READY, naming what is missing; CANCELLED.
+            OpenArmError: NOT_READY, naming what is missing; ROBOT_LOST; as `missing`.
         """
-        self._cancelled = False
-        self._silence = Silence(_STARVED_S)
-        self._active = True
-        self.robot.enable(True)
-        self.pads.enable(self._config.held.use_finger_force)
-        self._timer.reset()
+        if not self._active:
+            self._silence = Silence(_STARVED_S)
+            self._active = True
+            self.robot.enable(True)
+            self.pads.enable(self._config.held.use_finger_force)
+            self._timer.reset()
         deadline = time.monotonic() + self._config.limits.ready_timeout
         while faults := missing():
             self.check()
@@ -109,10 +109,6 @@ class GraphClients:
         self._timer.cancel()
         self.robot.enable(False)
         self.pads.enable(False)
-
-    def cancel(self) -> None:
-        """Let what is waited for end with CANCELLED."""
-        self._cancelled = True
 
     @property
     def now_ns(self) -> int:
@@ -142,10 +138,8 @@ class GraphClients:
         """Raise when the grasp may not go on.
 
         Raises:
-            OpenArmError: CANCELLED or ROBOT_LOST.
+            OpenArmError: ROBOT_LOST.
         """
-        if self._cancelled:
-            raise OpenArmError(Code.CANCELLED, "cancelled; the arm holds where it is and the hand keeps what it holds")
         self._silence.check(self._config.limits.joint_state_timeout)
 
     async def until(
@@ -160,7 +154,7 @@ class GraphClients:
             guard: Called at each check; may raise.
 
         Raises:
-            OpenArmError: TIMEOUT, CANCELLED, ROBOT_LOST, or from `guard`.
+            OpenArmError: TIMEOUT, ROBOT_LOST, or from `guard`.
         """
         deadline = time.monotonic() + limit
         while not done():
@@ -232,7 +226,7 @@ class GraphClients:
         return answer.result
 
     # --- observing
-    async def observe(self, count: int, topic: str, camera: str, limit: float) -> Frames:
+    async def observe(self, count: int, topic: str, camera: str, limit: float, guard: Callable[[], None]) -> Frames:
         """Collect frames of detections that are taken from now on, in the base frame.
 
         Args:
@@ -240,16 +234,17 @@ class GraphClients:
             topic: Topic of the detector.
             camera: Name of its camera.
             limit: Longest wait, s of wall clock.
+            guard: Same as for `until`.
 
         Raises:
-            OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST; NO_TRANSFORM, when the pose of
+            OpenArmError: STALE_DATA, when they do not come; ROBOT_LOST, or from `guard`; NO_TRANSFORM, when the pose of
                 their frame is not known.
         """
         self._frames = []
         self._observing_since_ns, self._topic = self.now_ns, topic
         self.listen(topic)
         try:
-            await self.until(lambda: len(self._frames) >= count, limit, "observing")
+            await self.until(lambda: len(self._frames) >= count, limit, "observing", guard)
         except OpenArmError as error:
             if error.code is not Code.TIMEOUT:
                 raise

@@ -54,26 +54,27 @@ class GraphRobot:
         self.deadline_ns, self.velocity_scale = 0, config.velocity_scale
         #: Longest start delay of a motion until the other arm leaves clearance, s; 0: the arms never move at once.
         self.max_start_delay = 0.0
+        self._cancelled = False
 
     def next_to_other(self) -> GraphRobot:
-        """The same for an arm that moves while the other does: its motions may start later, its deadline is its own."""
+        """The same for an arm that moves while the other does: its motions may start later, and it ends by itself."""
         robot = copy(self)
         robot.max_start_delay = self._config.limits.beside_wait
         return robot
 
     # --- begin, end, cancel
-    async def begin(self, what: str, *, moves: bool) -> None:
+    async def begin(self, what: str, arms: Sequence[str]) -> None:
         """Listen to the robot and wait until every node that a grasp needs is there.
 
         Args:
-            what: That begins, for other clients of the arms that it will move.
-            moves: It will move arms.
+            what: That is carried out, for other clients of the arms.
+            arms: Those that it will move.
 
         Raises:
             OpenArmError: NOT_READY, naming what is missing; CANCELLED.
         """
-        self._holder.name = f"the grasp node ({what})"
-        await self._nodes.begin(lambda: self._missing(moves))
+        self._cancelled, self._holder.name = False, f"the grasp node ({what})"
+        await self._nodes.begin(lambda: self._missing(arms))
 
     def end(self) -> None:
         """Stop listening, and leave the arms to others."""
@@ -101,9 +102,10 @@ class GraphRobot:
 
     def cancel(self) -> None:
         """Let what runs end with CANCELLED and the arm hold."""
-        self._nodes.cancel()
+        self._cancelled = True
 
-    def _missing(self, moves: bool) -> list[str]:
+    def _missing(self, arms: Sequence[str]) -> list[str]:
+        self._check_cancel()
         needed = {
             "action /motion/plan_approach (motion node)": self._plan.server_is_ready(),
             "action /motion/execute (motion node)": self._execute.server_is_ready(),
@@ -111,10 +113,9 @@ class GraphRobot:
             "publisher of /detections_3d (detector)": self._nodes.sees(DETECTIONS),
             "/joint_states (bridge or robot driver)": self._nodes.has_joint_states,
         }
-        if moves:
-            for arm, client in self._grippers.items():
-                name = f"action {self._config.gripper.format(arm=arm)} (bridge, arm_control or robot driver)"
-                needed[name] = client.server_is_ready()
+        for arm in arms:
+            name = f"action {self._config.gripper.format(arm=arm)} (bridge, arm_control or robot driver)"
+            needed[name] = self._grippers[arm].server_is_ready()
         return [what for what, there in needed.items() if not there]
 
     # --- the robot
@@ -157,7 +158,12 @@ class GraphRobot:
     def check(self) -> None:
         """Raise when the grasp may not go on."""
         self._nodes.check()
+        self._check_cancel()
         check_deadline(self.now_ns, self.deadline_ns)
+
+    def _check_cancel(self) -> None:
+        if self._cancelled:
+            raise OpenArmError(Code.CANCELLED, "cancelled; the arm holds where it is and the hand keeps what it holds")
 
     def warn(self, text: str) -> None:
         """Write a warning into the log."""
@@ -172,6 +178,7 @@ class GraphRobot:
 
     def _watched(self, guard: Callable[[], None] | None) -> Callable[[], None]:
         def check() -> None:
+            self._check_cancel()
             check_deadline(self.now_ns, self.deadline_ns)
             if guard is not None:
                 guard()
@@ -202,11 +209,12 @@ class GraphRobot:
     async def observe(self, count: int, *, near: str = "") -> Frames:
         """Frames of detections that are taken from now on."""
         if not near:
-            return await self._nodes.observe(count, DETECTIONS, self._config.camera, self._config.detect.frame_timeout)
+            config, watched = self._config, self._watched(None)
+            return await self._nodes.observe(count, DETECTIONS, config.camera, config.detect.frame_timeout, watched)
         topic = self._config.near.topic.format(camera=near)
         if not self._nodes.sees(topic):
             raise OpenArmError(Code.NOT_READY, f"no node publishes {topic}")
-        return await self._nodes.observe(count, topic, near, self._config.near.timeout)
+        return await self._nodes.observe(count, topic, near, self._config.near.timeout, self._watched(None))
 
     def expect_near(self, camera: str) -> None:
         """Wake the detector of the camera on the hand."""
@@ -241,7 +249,7 @@ class GraphRobot:
     async def _answer(self, client: Client, request: object, what: str) -> Any:
         """Ask a service of the motion node."""
         answered, died = client.call_async(request), self._plan.watch()
-        check = lambda: check_alive(died, what, Code.ROBOT_LOST)  # noqa: E731
+        check = self._watched(lambda: check_alive(died, what, Code.ROBOT_LOST))
         try:
             await self._nodes.until(answered.done, self._config.limits.answer_timeout, what, check)
         finally:

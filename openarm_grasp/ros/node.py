@@ -7,7 +7,7 @@ topics /grasp/status and /grasp/markers.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import GraspSession, Status, Task
+from openarm_grasp.robot.coordination import ArmCoordination, coordinated
 from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.learn import learn_hand
 from openarm_grasp.robot.skills import Skills
@@ -54,7 +55,10 @@ _QOS_STATUS = QoSProfile(depth=20, reliability=QOS_LATCHED.reliability, durabili
 
 
 class GraspNode(BaseNode[GraspConfig]):
-    """Serves one request at a time, of one object or of two; another while it runs is answered at once with BUSY."""
+    """Serves a request for each arm at a time, or one for both; another meanwhile is answered at once with BUSY.
+
+    A request for an arm by name takes that arm alone, and one for any arm both of them, or the one that is free.
+    """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("grasp", GraspConfig, **kwargs)
@@ -66,10 +70,11 @@ class GraspNode(BaseNode[GraspConfig]):
         self._flight_recorder = FlightRecorderClient(self)
         self._robot.follow_table(self._take_table)
         self._robot.follow_mounts(self._take_mounts)
-        #: What is being carried out, for the answer to what comes meanwhile.
-        self._running = ""
+        #: What each arm is at work on, for the answer to what comes meanwhile.
+        self._coordination = ArmCoordination()
         self._newest: dict[int, Status] = {}
-        self._goal: ServerGoalHandle | None = None
+        #: What a cancel of a goal reaches, by id of the goal.
+        self._cancels: dict[bytes, Sequence[GraphRobot]] = {}
         self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
         self._marker_topic = self.create_publisher(MarkerArray, "/grasp/markers", QOS_LATCHED)
         self.create_service(Grasp, "/grasp", self._on_grasp)
@@ -115,7 +120,7 @@ class GraspNode(BaseNode[GraspConfig]):
     async def _on_release(self, request: ReleaseHand.Request, response: ReleaseHand.Response) -> ReleaseHand.Response:
         try:
             response.message = await self._take(
-                "the release of a hand", lambda: self._session.release(self._skills, request.arm), moves=True
+                "the release of a hand", self._arms, lambda: self._session.release(self._skills, request.arm)
             )
             response.success, response.code = True, Code.OK.value
         except OpenArmError as error:
@@ -125,7 +130,7 @@ class GraspNode(BaseNode[GraspConfig]):
 
     async def _on_learn(self, arm: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            response.message = await self._take("the learning of a hand", lambda: self._learn(arm), moves=True)
+            response.message = await self._take("the learning of a hand", self._arms, lambda: self._learn(arm))
             response.success = True
         except OpenArmError as error:
             response.message = f"{error.code}: {error.message}"
@@ -137,7 +142,7 @@ class GraspNode(BaseNode[GraspConfig]):
             goal.publish_feedback(Pick.Feedback(status=status))
 
         request, result = messages.request_from_msg(goal.request), Pick.Result()
-        messages.fill_answer(result, await self._as_goal(goal, lambda: self._one(request, feedback)))
+        messages.fill_answer(result, await self._as_goal(goal, self._one(request, feedback, goal)))
         return result
 
     async def _on_pick_two(self, goal: ServerGoalHandle) -> PickTwo.Result:
@@ -145,15 +150,11 @@ class GraspNode(BaseNode[GraspConfig]):
             goal.publish_feedback(PickTwo.Feedback(request=which, status=status))
 
         requests = messages.requests_from_msg(goal.request)
-        return messages.pair_result(await self._as_goal(goal, lambda: self._two(requests, feedback)))
+        return messages.pair_result(await self._as_goal(goal, self._two(requests, feedback, goal)))
 
-    async def _as_goal(self, goal: ServerGoalHandle, work: Callable[[], Awaitable[OutcomeT]]) -> OutcomeT:
-        """Carry a goal out; a cancel reaches the one that is being carried out."""
-        if not self._running:
-            self._goal = goal
-        outcome = await work()
-        if self._goal is goal:
-            self._goal = None
+    async def _as_goal(self, goal: ServerGoalHandle, work: Awaitable[OutcomeT]) -> OutcomeT:
+        """Carry a goal out."""
+        outcome = await work
         if outcome.success:
             goal.succeed()
         elif goal.is_cancel_requested and outcome.code is Code.CANCELLED:
@@ -163,10 +164,10 @@ class GraspNode(BaseNode[GraspConfig]):
         return outcome
 
     def _on_cancel(self, goal: ServerGoalHandle) -> CancelResponse:
-        if self._goal is None or goal.goal_id != self._goal.goal_id:
-            return CancelResponse.REJECT
-        self._robot.cancel()
-        return CancelResponse.ACCEPT
+        robots = self._cancels.get(_id_of(goal), ())
+        for robot in robots:
+            robot.cancel()
+        return CancelResponse.ACCEPT if robots else CancelResponse.REJECT
 
     def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> ActionServer:
         return ActionServer(self, kind, name, execute, cancel_callback=self._on_cancel)
@@ -185,42 +186,68 @@ class GraspNode(BaseNode[GraspConfig]):
         self._session.context = replace(self._session.context, hands=self.description.hands)
         return f"the {arm} hand goes from {reach}, and presses with {reach.effort:.0f} N closed on nothing; in {path}"
 
-    async def _learn_unknown(self, *requests: GraspRequest) -> None:
+    async def _learn_unknown(self, arms: Sequence[str], *requests: GraspRequest) -> None:
         """Learn the hands of which nothing was learned, where that is allowed, before requests that may move them."""
         if self.config.hand.learn and not any(one.dry_run or one.phase == "place" for one in requests):
             for arm, hand in self.description.hands.items():
-                if hand.reach is None:
+                if arm in arms and hand.reach is None:
                     self.get_logger().info(await self._learn(arm))
 
     # --- requests
-    async def _one(self, request: GraspRequest, on_status: OnStatus | None = None) -> GraspOutcome:
-        report = partial(self._publish, on_status=on_status)
+    @property
+    def _arms(self) -> Sequence[str]:
+        return self.description.arm_names
+
+    def _arm_of(self, request: GraspRequest) -> str:
+        """The arm that a request takes alone; "": it takes all."""
+        free = [arm for arm in self._arms if arm not in self._coordination.at_work]
+        if request.confirm or len(self._arms) < 2:  # plans are shown one at a time
+            return ""
+        if request.arm in self._arms:
+            return request.arm
+        return free[0] if len(free) == 1 and request.arm in ("", "auto") else ""
+
+    async def _one(
+        self, request: GraspRequest, on_status: OnStatus | None = None, goal: ServerGoalHandle | None = None
+    ) -> GraspOutcome:
+        report, arm, robot = partial(self._publish, on_status=on_status), self._arm_of(request), self._robot
+        arms, index = (arm,) if arm else self._arms, self._arms.index(arm) if arm else 0
+        if arm:
+            request, robot = replace(request, arm=arm), self._robot.next_to_other()
 
         async def work() -> GraspOutcome:
-            await self._learn_unknown(request)
-            return await carry_out(Task(self._session, self._skills, request, report))
+            await self._learn_unknown(arms, request)
+            skills = coordinated(arm, robot, self._coordination, self.config) if arm else self._skills
+            return await carry_out(Task(self._session, skills, request, report, index))
 
         try:
-            outcome = await self._take(_grasp_of(request.cut()), work, moves=not request.dry_run)
+            outcome = await self._take(
+                _grasp_of(request.cut()), arms, work, robots=(robot,), goal=goal, moves=not request.dry_run
+            )
         except OpenArmError as error:
             request = request.cut()
-            self._refused(f"grasp of {request.label!r}", error)
+            self._refused(f"grasp of {request.label!r}", error, index)
             outcome = GraspOutcome(error.code, error.message, request.label)
         else:
             self._report(outcome)
         return replace(outcome, recording=await self._flight_recorder.save(outcome, (request,)))
 
-    async def _two(self, requests: tuple[GraspRequest, GraspRequest], on_status: OnStatus) -> PairOutcome:
+    async def _two(
+        self, requests: tuple[GraspRequest, GraspRequest], on_status: OnStatus, goal: ServerGoalHandle
+    ) -> PairOutcome:
         report = partial(self._publish, on_status=on_status)
-        robots: dict[str, RobotInterface] = {arm: self._robot.next_to_other() for arm in self.description.arm_names}
+        each = {arm: self._robot.next_to_other() for arm in self._arms}
+        robots: dict[str, RobotInterface] = {**each}
 
         async def work() -> PairOutcome:
-            await self._learn_unknown(*requests)
+            await self._learn_unknown(self._arms, *requests)
             return await carry_out_pair(Pair(self._session, self._skills, robots, requests, report, carry_out))
 
         named = _grasp_of(*(request.cut() for request in requests))
         try:
-            outcome = await self._take(named, work, moves=not requests[0].dry_run)
+            outcome = await self._take(
+                named, self._arms, work, robots=(self._robot, *each.values()), goal=goal, moves=not requests[0].dry_run
+            )
         except OpenArmError as error:
             requests = (requests[0].cut(), requests[1].cut())
             self._refused(f"grasp of {requests[0].label!r} and {requests[1].label!r}", error)
@@ -229,27 +256,47 @@ class GraspNode(BaseNode[GraspConfig]):
             self._report(answer)
         return replace(outcome, recording=await self._flight_recorder.save(outcome, requests))
 
-    async def _take(self, what: str, work: Callable[[], Awaitable[AnswerT]], *, moves: bool) -> AnswerT:
-        """Carry out one thing at a time.
+    async def _take(
+        self,
+        what: str,
+        arms: Sequence[str],
+        work: Callable[[], Awaitable[AnswerT]],
+        *,
+        robots: Sequence[GraphRobot] = (),
+        goal: ServerGoalHandle | None = None,
+        moves: bool = True,
+    ) -> AnswerT:
+        """Carry something out with arms that are free.
+
+        Args:
+            what: What it is.
+            arms: Which.
+            work: Carries it out.
+            robots: Those that a cancel of the goal reaches; none: the one of all arms.
+            goal: That asks for it; None: a service does.
+            moves: It will move arms.
 
         Raises:
             OpenArmError: BUSY, NOT_READY or INVALID_ARGUMENT, when it is not taken; CANCELLED before it began.
         """
-        if self._running:
-            raise OpenArmError(Code.BUSY, f"{self._running} is running; cancel it or wait until it has ended")
-        self._running = what
+        robots = robots or (self._robot,)
         try:
-            await self._robot.begin(what, moves=moves)
-            return await work()
+            with self._coordination.taking(arms, what):
+                if goal is not None:
+                    self._cancels[_id_of(goal)] = robots
+                named = " and ".join(dict.fromkeys(self._coordination.at_work.values()))
+                await robots[0].begin(named, arms if moves else ())
+                return await work()
         finally:
-            self._robot.end()
-            self._running = ""
+            if goal is not None:
+                self._cancels.pop(_id_of(goal), None)
+            if not self._coordination.at_work:
+                self._robot.end()
 
-    def _refused(self, what: str, error: OpenArmError) -> None:
+    def _refused(self, what: str, error: OpenArmError, index: int = 0) -> None:
         self.get_logger().warning(f"{what} refused: {error}")
         if error.code is not Code.BUSY:  # what runs publishes its own state
-            status = Status(State.IDLE, State.IDLE, error.message, code=error.code.value)
-            self._status_topic.publish(messages.status_msg(status, self.description.base, self._robot.now_ns))
+            self._publish(Status(State.IDLE, State.IDLE, error.message, code=error.code.value, request=index), None)
             self._diagnose(error.code is not Code.NOT_READY, f"{error.code}: {error.message}")
 
     # --- publishing
@@ -296,6 +343,10 @@ class GraspNode(BaseNode[GraspConfig]):
         answered = before is not None and before.plan is not None
         if status.candidates or status.plan or answered:
             self._marker_topic.publish(messages.status_markers(status, self.description, t_ns))
+
+
+def _id_of(goal: ServerGoalHandle) -> bytes:
+    return bytes(goal.goal_id.uuid)
 
 
 def _grasp_of(*requests: GraspRequest) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,7 @@ from openarm_bringup.commands import connect, pick
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import Option
-from openarm_grasp.requests.request import GraspRequest
-from openarm_grasp.ros.client import GraspResult, PairResult
+from openarm_grasp.ros.client import GraspResult
 from tests.openarm_bringup.commands import record_of
 
 OPTIONS = (
@@ -137,24 +137,20 @@ def test_without_a_terminal_a_plan_waits_for_the_service(
 def test_an_order_lists_what_is_left_with_place_and_reason(
     client: Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    answers = [
-        GraspResult(True, Code.OK, "placed", "SUCCESS", "cup", "left", 1, (0.2, 0.3, 0.4), 9.0, (0.3, 0.0, 0.42)),
-        GraspResult(False, Code.TOO_WIDE, "190 mm", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0, (0.2, 0.1, 0.45)),
-        *[GraspResult(False, Code.UNKNOWN_OBJECT, "no more", "REFUSED", "", "", 0, (0.0, 0.0, 0.0), 1.0)] * 3,
-    ]
-    asked: list[dict[str, Any]] = []
+    asked, cups, lock = list[dict[str, Any]](), ["cup"], threading.Lock()
 
     def answer(label: str, **more: Any) -> GraspResult:
-        asked.append({"label": label, **more})
-        return answers.pop(0)
-
-    def both(*requests: GraspRequest, **_: Any) -> PairResult:
-        results = tuple(answer(**vars(request)) for request in requests)
-        code = next((one.code for one in results if not one.success), Code.OK)
-        return PairResult(False, code, "", "PARTIAL", True, results, 9.0)
+        nowhere, wide = (0.0, 0.0, 0.0), (0.2, 0.1)
+        with lock:
+            asked.append({"label": label, **more})
+            if more["phase"] == "all" and cups:
+                return GraspResult(True, Code.OK, "placed", "SUCCESS", cups.pop(), "left", 1, (0.2, 0.3, 0.4), 9.0,
+                                   (0.3, 0.0, 0.42))  # fmt: skip
+        if more["phase"] == "all" and wide not in more["exclude_near"]:
+            return GraspResult(False, Code.TOO_WIDE, "190 mm", "REFUSED", "", "", 0, nowhere, 1.0, (*wide, 0.45))
+        return GraspResult(False, Code.UNKNOWN_OBJECT, "no more", "REFUSED", "", "", 0, nowhere, 1.0)
 
     monkeypatch.setattr(client, "pick", answer)
-    monkeypatch.setattr(client, "pick_two", both, raising=False)
     bins = tmp_path / "bins.yaml"
     bins.write_text("bins: {tray: {x: [0.15, 0.25], y: [0.2, 0.44]}}\nrest: tray\n")
     outcome = pick.order("anything", bins=bins)
@@ -163,7 +159,8 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     assert outcome.text == "left: anything at (0.200, 0.100) m: TOO_WIDE: 190 mm\n"
     data = json.loads(json.dumps(outcome.data, allow_nan=False))
     assert data["left"][0]["where"] == [0.2, 0.1]
-    assert [row["place"] for row in data["results"]] == [[0.2, 0.3, 0.4], *[None] * 4]
-    assert [one["place_choices"] for one in asked[:2]] == [((0.2, 0.26), (0.2, 0.38)), ((0.2, 0.38), (0.2, 0.26))]
-    assert [one["exclude_near"] for one in asked[2:4]] == [((0.2, 0.3), (0.2, 0.1))] * 2
-    assert (asked[4]["object_at"], asked[4]["phase"]) == ((0.2, 0.1), "aside")
+    assert [row["place"] for row in data["results"] if row["place"]] == [[0.2, 0.3, 0.4]]
+    first = {one["arm"]: one["place_choices"] for one in asked if not one["exclude_near"]}
+    assert first == {"left": ((0.2, 0.26), (0.2, 0.38)), "right": ((0.2, 0.38), (0.2, 0.26))}
+    assert {one["arm"] for one in asked if {(0.2, 0.3), (0.2, 0.1)} <= {*one["exclude_near"]}} == {"left", "right"}
+    assert (asked[-1]["object_at"], asked[-1]["phase"], asked[-1]["arm"]) == ((0.2, 0.1), "aside", "auto")
