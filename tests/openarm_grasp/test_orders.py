@@ -403,3 +403,155 @@ def test_what_is_seen_for_a_moment_does_not_keep_for_good_from_what_it_is_a_part
         ((0.30, 0.08), Code.IN_COLLISION),
         ((0.40, 0.18), Code.UNKNOWN_OBJECT),
     ]
+
+
+class Crew:
+    """Arms that each take what they reach of objects on a table, in the order in which requests began.
+
+    Attributes:
+        within: Range of y that each arm reaches, m.
+        at: What each request is at; no other request takes it.
+        together: Requests that ran while another did.
+    """
+
+    def __init__(self, order: Order, objects: dict[str, tuple[float, float]], **within: tuple[float, float]) -> None:
+        self.order, self.objects, self.within = order, objects, within
+        self.at: dict[int, str] = {}
+        self.asked, self.taken, self.together = list[GraspRequest](), list[tuple[str, str]](), 0
+
+    def begin(self) -> None:
+        while (ask := self.order.next()) is not None:
+            self.asked.append(ask)
+            assert len(self.asked) < 60
+            self.together += len(self.order.running) > 1
+            free = [n for n, at in self.objects.items() if n not in self.at.values() and at not in ask.exclude_near]
+            self.at[id(ask)] = next((n for n in free if ask.object_at in (None, self.objects[n])), "")
+
+    def end(self, ask: GraspRequest, code: Code | None = None, **how: bool) -> None:
+        """End a request: what is reached is placed."""
+        name = self.at.pop(id(ask))
+        if code is not None or not name:
+            self.order.done(ask, code or Code.UNKNOWN_OBJECT, "injected", **how)
+            return
+        x, y = self.objects[name]
+        bands = [self.within[ask.arm]] if ask.arm in self.within else self.within.values()
+        if not any(low <= y <= high for low, high in bands):
+            self.order.done(ask, Code.UNREACHABLE, f"{name} is too far", seen=(x, y, 0.4))
+            return
+        self.taken.append((ask.arm, name))
+        del self.objects[name]
+        self.order.done(ask, Code.OK, "", placed=(1.0, 0.1 * len(self.taken)), seen=(x, y, 0.4), touched=True)
+
+    def work(self, last: int = 0) -> None:
+        """Let the request end that began first, or last, until the order has ended."""
+        self.begin()
+        while self.order.running:
+            self.end(self.order.running[last])
+            self.begin()
+
+
+ARMS = ("left", "right")
+ROW = {name: (0.3, round(0.3 - 0.1 * i, 1)) for i, name in enumerate("abcdef")}
+BOTH = {"left": (-0.1, 9.0), "right": (-9.0, 0.1)}
+
+
+@pytest.mark.requirement("R-17")
+@pytest.mark.parametrize("last", [0, -1])
+def test_each_arm_takes_the_next_object_as_soon_as_it_is_free_and_what_only_one_reaches_is_left_to_it(last) -> None:
+    crew = Crew(Order(("anything",), arms=ARMS), dict(ROW), **BOTH)
+    crew.work(last)
+    assert sorted(name for _, name in crew.taken) == list("abcdef")
+    assert crew.order.outcome == "SUCCESS"
+    assert all(("right", name) not in crew.taken for name in "ab")
+    assert all(("left", name) not in crew.taken for name in "ef")
+    assert crew.together >= 4
+
+
+def test_an_arm_that_has_ended_never_waits_for_the_other() -> None:
+    crew = Crew(Order(("anything",), arms=ARMS), dict(ROW), left=(-9.0, 9.0), right=(-9.0, 9.0))
+    crew.begin()
+    slow = next(ask for ask in crew.order.running if ask.arm == "right")
+    for _ in range(5):
+        crew.end(next(ask for ask in crew.order.running if ask is not slow))
+        crew.begin()
+    assert [arm for arm, _ in crew.taken] == ["left"] * 5
+    crew.end(slow)
+    crew.work()
+    assert (len(crew.taken), crew.order.outcome) == (6, "SUCCESS")
+
+
+@pytest.mark.requirement("P-02")
+def test_what_an_arm_does_in_vain_never_stops_the_other() -> None:
+    crew = Crew(Order(("anything",), arms=ARMS), dict(ROW), left=(-9.0, 9.0), right=(-9.0, 9.0))
+    crew.begin()
+    while crew.order.running:
+        ask = crew.order.running[0]
+        crew.end(ask, Code.GRASP_MISSED if ask.arm == "right" else None, touched=True)
+        crew.begin()
+    assert crew.order.placed == ["anything"] * 6
+
+
+@pytest.mark.requirement("P-21")
+@pytest.mark.parametrize("code", [Code.STOPPED, Code.ROBOT_LOST, Code.NOT_READY])
+def test_one_arm_goes_on_when_the_other_is_stopped_or_missing(code) -> None:
+    crew = Crew(Order(("anything",), arms=ARMS), dict(ROW), left=(-9.0, 9.0), right=(-9.0, 9.0))
+    crew.begin()
+    crew.end(next(ask for ask in crew.order.running if ask.arm == "left"), code)
+    crew.work()
+    assert [arm for arm, _ in crew.taken] == ["right"] * 6
+    assert crew.order.outcome == "SUCCESS"
+    assert all(ask.arm == "right" for ask in crew.asked[2:])
+
+
+def test_an_order_ends_when_both_arms_are_stopped_or_one_is_cancelled() -> None:
+    for codes in ((Code.STOPPED, Code.STOPPED), (Code.CANCELLED, None)):
+        crew = Crew(Order(("anything",), arms=ARMS), dict(ROW), **BOTH)
+        crew.begin()
+        for ask, code in zip([*crew.order.running], codes, strict=True):
+            crew.end(ask, code)
+        assert crew.order.next() is None
+        assert crew.order.over
+
+
+def test_what_one_arm_cannot_take_is_left_when_the_other_cannot_either_and_listed_once() -> None:
+    crew = Crew(Order(("anything",), arms=ARMS), dict(ROW) | {"far": (0.9, 0.0)}, left=(0.01, 9.0), right=(-9.0, -0.01))
+    crew.work()
+    assert len(crew.taken) == 5
+    assert {one.where for one in crew.order.left} == {(0.9, 0.0), (0.3, 0.0)}
+    assert crew.order.outcome == "PARTIAL"
+
+
+def test_what_nothing_was_seen_of_by_one_arm_is_asked_of_the_other_before_an_order_ends() -> None:
+    order = Order(("anything",), arms=ARMS)
+    left, right = order.next(), order.next()
+    assert (left.arm, right.arm, order.next()) == ("left", "right", None)
+    assert order.done(left, Code.UNKNOWN_OBJECT, "the other arm hides it") is None
+    assert order.next() is None
+    order.done(right, Code.OK, "", placed=(0.2, 0.1), seen=(0.3, 0.0), touched=True)
+    assert order.next().arm == "right"
+
+
+def test_no_more_objects_are_asked_for_at_once_than_are_wanted() -> None:
+    order = Order(("red", "blue"), BINS, each=1, arms=ARMS)
+    first, second = order.next(), order.next()
+    assert [ask.label for ask in (first, second)] == ["easiest red", "easiest blue"]
+    assert first.place_choices == BINS.bins["left"].slots(BINS.spacing)
+    assert second.place_choices == BINS.bins["right"].slots(BINS.spacing)[::-1]  # of one bin, from its other end
+    order.done(first, Code.OK, "", placed=(0.2, 0.1))
+    assert order.next() is None
+    order.done(second, Code.OK, "", placed=(0.2, -0.1))
+    assert (order.next(), order.outcome) == (None, "SUCCESS")
+
+
+@pytest.mark.requirement("R-17")
+def test_what_a_hand_still_holds_is_put_down_when_the_other_arm_has_ended() -> None:
+    order = Order(("anything",), arms=ARMS)
+    left, right = order.next(), order.next()
+    order.done(left, Code.PLACE_FAILED, "the hand keeps it", seen=(0.3, 0.2), touched=True, held=True)
+    assert order.next() is None
+    order.done(right, Code.PLACE_FAILED, "so does the other", seen=(0.3, -0.2), touched=True, held=True)
+    for _ in ARMS:
+        placing = order.next()
+        assert (placing.phase, placing.arm, order.next()) == ("place", "auto", None)
+        order.done(placing, Code.OK, "", placed=(0.2, 0.1))
+    assert {order.next().arm, order.next().arm} == {"left", "right"}
