@@ -98,8 +98,8 @@ class CoordinatedRobot:
     async def observe(self, count: int, *, near: str = "") -> Frames:
         """Frames that are taken from now on.
 
-        The first are taken at once: what the other arm hides may not be needed. An arm that observes from home again
-        waits until the other one hides nothing any more; one that is on its way does not.
+        What the other arm hides may not be needed. An arm that observes from home again without a motion in between
+        waits until the other one hides nothing any more.
         """
         coordination, limit = self._coordination, self._config.limits.beside_timeout
         again, self._observed = self._observed, self._observed or not near
@@ -131,6 +131,7 @@ class CoordinatedRobot:
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
     ) -> None:
         """Follow a planned trajectory, when the other arm leaves clearance for it."""
+        self._observed = False
         await self._patiently(lambda: self._robot.follow(arm, trajectory, what, guard), what)
 
     async def move(
@@ -143,6 +144,7 @@ class CoordinatedRobot:
             await self._robot.move(arm, to, what, obstacles, plan_only=plan_only)
 
         if arm != self._other:
+            self._observed = False
             await self._robot.until(lambda: coordination.sent_home != arm, self._config.limits.beside_timeout, what)
             await self._patiently(work, what)
             return

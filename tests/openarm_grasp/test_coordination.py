@@ -125,9 +125,12 @@ def test_an_arm_looks_at_once_and_from_home_again_when_the_other_hides_nothing()
     run(left.observe(3))
     assert (robot.steps, robot.looks) == (4, 2)
     robot.away("right")
-    robot.away("left")  # on its way
+    run(left.move("left", "home", "go home"))
     run(left.observe(3))
     assert (robot.steps, robot.looks) == (4, 3)
+    robot.away("left")  # over the table
+    run(left.observe(3))
+    assert (robot.steps, robot.looks) == (4, 4)
 
 
 def test_an_arm_that_is_not_at_work_hides_nothing_that_it_would_be_waited_for() -> None:

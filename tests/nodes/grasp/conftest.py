@@ -259,6 +259,10 @@ class FakeGraph(Node):
         server = ActionServer(self, kind, name, execute, callback_group=self._group, cancel_callback=self._cancel)
         self._servers.append(server)
 
+    def lose_hand(self, arm: str) -> None:
+        """Let the controller of a hand be gone."""
+        self._servers.pop(-1 if arm == ARMS[-1] else -2).destroy()
+
     def close(self) -> None:
         for server in self._servers:
             server.destroy()
