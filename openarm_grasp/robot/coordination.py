@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -37,12 +37,14 @@ class ArmCoordination:
         at_work: What each arm is at work on, by arm; others rest.
         waiting: Arms that wait until the other goes on.
         observing: The arm that observes; "" when none does.
+        seen: Newest frames of the camera over the table.
         sent_home: The arm at rest that the other sends home; "" when none is.
     """
 
     at_work: dict[str, str] = field(default_factory=dict[str, str])
     waiting: set[str] = field(default_factory=set[str])
     observing: str = ""
+    seen: Frames = field(default_factory=lambda: Frames((), ""))
     sent_home: str = ""
 
     @contextmanager
@@ -79,7 +81,7 @@ class CoordinatedRobot:
         self._other = next(name for name in robot.description.arm_names if name != arm)
         self._homes = {a: robot.description.group_state(f"{a}_arm", config.home_state) for a in (arm, self._other)}
         self.deadline_ns, self.velocity_scale = 0, robot.velocity_scale
-        self._observed = False
+        self._begun = self._observed = False
 
     def __getattr__(self, name: str) -> Any:
         """What is the same for an arm alone."""
@@ -96,24 +98,30 @@ class CoordinatedRobot:
 
     # --- observing
     async def observe(self, count: int, *, near: str = "") -> Frames:
-        """Frames that are taken from now on.
+        """Frames that are taken from now on, also for the other arm; for a request that begins, recent ones.
 
         What the other arm hides may not be needed. An arm that observes from home again without a motion in between
         waits until the other one hides nothing any more.
         """
-        coordination, limit = self._coordination, self._config.limits.beside_timeout
-        again, self._observed = self._observed, self._observed or not near
+        coordination, limit, robot = self._coordination, self._config.limits.beside_timeout, self._robot
+        since_ns = robot.now_ns - (0 if self._begun else round(self._config.detect.max_age * 1e9))
+        again, self._begun = self._observed, True
+        self._observed = self._observed or not near
         if again and not near and self._is_home(self.arm):
-            await self._robot.until(self._other_is_away, limit, f"observing: the {self._other} arm is in the view")
-        await self._robot.until(
-            lambda: coordination.observing in ("", self.arm), limit, "observing: the other arm observes"
-        )
+            await robot.until(self._other_is_away, limit, f"observing: the {self._other} arm is in the view")
+        await robot.until(lambda: coordination.observing in ("", self.arm), limit, "observing: the other arm observes")
+        known = replace(coordination.seen, frames=coordination.seen.frames[-count:])
+        if not near and len(known.frames) == count and known.frames[0].t_ns >= since_ns:
+            return known
         coordination.observing = self.arm
         try:
-            return await self._robot.observe(count, near=near)
+            seen = await robot.observe(count, near=near)
         finally:
             coordination.observing = ""
-            self._robot.stop_observing()
+            robot.stop_observing()
+        if not near:
+            coordination.seen = seen
+        return seen
 
     def expect_near(self, camera: str) -> None:
         """Announce an observation by the camera on the hand."""

@@ -11,7 +11,9 @@ import pytest
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.robot.coordination import ArmCoordination, CoordinatedRobot
+from openarm_grasp.robot.interface import Frames
 from tests.refusals import refused
 
 
@@ -61,9 +63,11 @@ class Robot:
     def warn(self, text: str) -> None:
         self.warnings.append(text)
 
-    async def observe(self, count: int, *, near: str = "") -> str:
+    async def observe(self, count: int, *, near: str = "") -> Frames:
         self.looks += 1
-        return "frames"
+        self.now_ns += count * 10**8
+        stamps = (self.now_ns - k * 10**8 for k in reversed(range(count)))
+        return Frames(tuple(Frame(t_ns, ()) for t_ns in stamps), "base")
 
     def stop_observing(self) -> None:
         pass
@@ -131,6 +135,29 @@ def test_an_arm_looks_at_once_and_from_home_again_when_the_other_hides_nothing()
     robot.away("left")  # over the table
     run(left.observe(3))
     assert (robot.steps, robot.looks) == (4, 4)
+
+
+def test_a_request_begins_with_recent_frames_and_what_was_seen_before_a_look_never_counts_for_it() -> None:
+    robot, coordination = Robot(), ArmCoordination({"left": "a grasp", "right": "a grasp"})
+    left, right = link(robot, "left", coordination), link(robot, "right", coordination)
+    seen = run(left.observe(3))
+    robot.now_ns += 10**8
+    assert run(right.observe(3)) == seen
+    assert run(right.observe(2)) != seen
+    robot.now_ns += 10**9
+    run(link(robot, "left", coordination).observe(2))
+    run(left.observe(1, near="wrist"))
+    assert robot.looks == 4
+    coordination.observing = "left"
+
+    def ends(step: int) -> None:
+        robot.now_ns += 10**8
+        coordination.observing = ""
+        coordination.seen = Frames((Frame(robot.now_ns, ()),), "base")  # taken while the right arm waited for them
+
+    robot.on_step = ends
+    assert run(right.observe(1)) == coordination.seen
+    assert robot.looks == 4
 
 
 def test_an_arm_that_is_not_at_work_hides_nothing_that_it_would_be_waited_for() -> None:

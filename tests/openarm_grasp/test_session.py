@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,8 +19,10 @@ from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import Box, propose
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome, Proof
+from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import Grasp, GraspSession
 from openarm_grasp.strategies.pair import check_pair
+from openarm_grasp.strategies.run import Run
 from tests.openarm_grasp.scripted import GoHome, Grip, World, standing
 from tests.refusals import refused, refuses
 
@@ -225,3 +228,62 @@ def test_the_arm_of_a_release_is_the_one_that_holds_and_must_be_said_when_both_d
     assert release() == "the right hand is open; it held 'red'"
     assert [grip.arm for grip in world.done(Grip)] == ["left", "right"]
     assert not world.session.kept
+
+
+# --- requests of two arms at the same time
+def next_to(world, label: str, arm: str = "right") -> Run:
+    """Another request that is being carried out, and is at nothing yet."""
+    request = GraspRequest(label, arm=arm)
+    return Run(world.task(request), request, None)
+
+
+def test_a_request_never_takes_what_another_one_is_at_or_puts_down(world) -> None:
+    other = next_to(world, "red")
+    other.seen_at = world.objects["red"].p_base
+    world.ends(Code.UNKNOWN_OBJECT, "besides 1 that must stay where they are", "red")
+    assert world.succeeds("anything").label == "blue"
+    other.seen_at = None
+    other.place_target = SimpleNamespace(position=world.objects["red"].p_base)
+    world.ends(Code.UNKNOWN_OBJECT, "besides 1 that must stay where they are", "red")
+
+
+def test_a_request_never_takes_what_another_one_has_placed_since_it_began(world) -> None:
+    other, (x, y, z) = next_to(world, "red"), world.objects["red"].p_base
+    proof = Proof(Verdict(Code.OK, "held"), Verdict(Code.OK, "at its place"))
+    placed = GraspOutcome(Code.OK, "placed", "red", attempts=1, place_position=(x, y, z), proof=proof)
+
+    def on_report(status) -> None:
+        if status.state is State.DETECT and other in world.session.runs:
+            other.state = State.RESET
+            other.end(placed)
+
+    world.on_report = on_report
+    world.ends(Code.UNKNOWN_OBJECT, "besides 1 that must stay where they are", "red")
+    world.succeeds("red")  # a request that comes afterwards may
+    assert world.session.runs == []
+
+
+def test_of_the_easiest_an_arm_by_name_takes_the_outermost_on_its_side_first(worlds) -> None:
+    for arm, expected in (("left", "blue"), ("right", "red"), ("auto", "green")):
+        world = worlds(standing("green", 0.26, 0.0), standing("blue", 0.26, 0.3), standing("red", 0.26, -0.3))
+        assert world.succeeds("easiest anything", arm=arm).label == expected
+
+
+@pytest.mark.requirement("P-01", "P-21")
+def test_an_arm_by_name_works_next_to_a_full_hand_that_it_neither_opens_nor_moves(world) -> None:
+    world.session.kept["left"] = kept("left", "blue")
+    world.session.partly_open = lambda robot, arm: arm == "left"
+    for arm in ("auto", "left"):
+        refused("left hand still holds 'blue'", world.session.check_hands, world, GraspRequest("red", arm=arm))
+    assert world.ask("red", arm="right").success
+    assert all("left" not in call.arms for call in world.done(GoHome))
+    assert {call.arm for call in world.done(Grip)} == {"right"}
+    assert list(world.session.kept) == ["left"]
+
+
+def test_what_the_other_hand_holds_unknown_is_no_reason_to_refuse_an_arm_by_name() -> None:
+    world = World(standing("red", 0.26, -0.2))
+    world.effort, world.session.partly_open = -30.0, lambda robot, arm: arm == "left"
+    refused("the left hand presses", world.ask, "red")
+    assert world.ask("red", arm="right").code is not Code.NOT_READY
+    refused("the left hand presses", world.ask, "red", arm="left")
