@@ -26,7 +26,7 @@ from openarm_grasp.planning.place import SAME_SPOT
 from openarm_grasp.requests.confirm import PlanGate, ShownPlan
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest, Spot
 from openarm_grasp.requests.state_times import StateClock
-from openarm_grasp.requests.states import State
+from openarm_grasp.requests.states import Hand, State
 
 if TYPE_CHECKING:
     from openarm_grasp.robot.skills import Skills
@@ -138,6 +138,12 @@ class GraspSession:
             spot for r in self.runs if r is not run for spot in (r.seen_at, r.place_target and r.place_target.position)
         ]
         return request.without(*((float(p[0]), float(p[1])) for p in ends if p is not None))
+
+    def staying(self, run: Run, others: Sequence[Detection]) -> tuple[Detection, ...]:
+        """Return objects without those that other hands are at; the map knows when they have been lifted."""
+        held = [r.seen_at for r in self.runs if r is not run and r.hand is not Hand.FREE and r.seen_at is not None]
+        radius = self.context.config.detect.match_radius
+        return tuple(d for d in others if all(math.dist(d.p_base[:2], p[:2]) > radius for p in held))
 
     def check_hands(self, robot: Skills, request: GraspRequest) -> None:
         """Refuse what would drop an object that an ended request left in a hand; forget one that is gone.

@@ -104,14 +104,14 @@ class CoordinatedRobot:
         waits until the other one hides nothing any more.
         """
         coordination, limit, robot = self._coordination, self._config.limits.beside_timeout, self._robot
-        since_ns = robot.now_ns - (0 if self._begun else round(self._config.detect.max_age * 1e9))
-        again, self._begun = self._observed, True
-        self._observed = self._observed or not near
+        begins, self._begun = not self._begun, True
+        since_ns = robot.now_ns - (round(self._config.detect.max_age * 1e9) if begins else 0)
+        again, self._observed = self._observed, self._observed or not near
         if again and not near and self._is_home(self.arm):
             await robot.until(self._other_is_away, limit, f"observing: the {self._other} arm is in the view")
         await robot.until(lambda: coordination.observing in ("", self.arm), limit, "observing: the other arm observes")
         known = replace(coordination.seen, frames=coordination.seen.frames[-count:])
-        if not near and len(known.frames) == count and known.frames[0].t_ns >= since_ns:
+        if not near and len(known.frames) == count and known.frames[-1 if begins else 0].t_ns >= since_ns:
             return known
         coordination.observing = self.arm
         try:

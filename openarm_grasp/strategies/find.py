@@ -172,7 +172,8 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
             raise
         run.seen_at = found.target.p_base
         target = on_table(found.target, top_z)
-        sighting = replace(found, target=target, others=_standing(found.others, top_z))
+        others = run.task.session.staying(run, found.others)
+        sighting = replace(found, target=target, others=_standing(others, top_z))
     age = (run.robot.now_ns - sighting.t_ns) * 1e-9
     if age > limits.max_age:
         text = f"the newest detection is {age:.2f} s old, expected at most {limits.max_age:g} s"

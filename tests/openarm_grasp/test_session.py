@@ -19,8 +19,9 @@ from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import Box, propose
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome, Proof
-from openarm_grasp.requests.states import State
+from openarm_grasp.requests.states import Hand, State
 from openarm_grasp.requests.task import Grasp, GraspSession
+from openarm_grasp.robot.interface import PlanGrasp
 from openarm_grasp.strategies.pair import check_pair
 from openarm_grasp.strategies.run import Run
 from tests.openarm_grasp.scripted import GoHome, Grip, World, standing
@@ -245,6 +246,17 @@ def test_a_request_never_takes_what_another_one_is_at_or_puts_down(world) -> Non
     other.seen_at = None
     other.place_target = SimpleNamespace(position=world.objects["red"].p_base)
     world.ends(Code.UNKNOWN_OBJECT, "besides 1 that must stay where they are", "red")
+
+
+def test_what_another_hand_is_about_to_lift_is_no_obstacle(world) -> None:
+    other = next_to(world, "red")
+    other.seen_at = world.objects["red"].p_base
+    for hand, expected in ((Hand.FREE, {"detected/red"}), (Hand.AT_OBJECT, set())):
+        other.hand = hand
+        world.log.clear()
+        world.grasp("blue", dry_run=True)
+        found = {box.id.rpartition("_")[0] for plan in world.done(PlanGrasp) for box in plan.obstacles}
+        assert found == expected
 
 
 def test_a_request_never_takes_what_another_one_has_placed_since_it_began(world) -> None:
