@@ -233,7 +233,9 @@ class Order:
         if self._given_up or not left:
             return None
         if any(one.after < self._moved for one in left):
-            self._before, self.left, self._asked, self._by_place = self.left, [], set(), []
+            out_of_reach = (one for one in self.left if one.arm != _ANY_ARM and one.code is Code.UNREACHABLE)
+            self._before, self._asked, self._by_place = self.left, set(), []
+            self.left = [replace(one, after=self._moved) for one in out_of_reach]  # of one arm
             return self._of_free_arm() or self._alone()
         stay = tuple(self._stand)
         for one in left:
@@ -257,8 +259,17 @@ class Order:
         return arm == _ANY_ARM and bool(self._able) and all((label, one) in self._asked for one in self._able)
 
     def _easiest(self, label: str, arm: str) -> GraspRequest:
-        """A request for any object of a label; whatever it was asked for as, what was placed or left is not meant."""
-        left = (one.where for one in self.left if one.where is not None and one.arm in (arm, _ANY_ARM))
+        """A request for any object of a label; whatever it was asked for as, what was placed or left is not meant.
+
+        What an arm reached, but could not take, may have come free when anything has been moved since.
+        """
+        kept = (one for one in self.left if one.arm in (arm, _ANY_ARM))
+        kept = (
+            one
+            for one in kept
+            if _ANY_ARM in (one.arm, arm) or one.code is Code.UNREACHABLE or one.after >= self._moved
+        )
+        left = (one.where for one in kept if one.where is not None)
         # of one bin, the last arm fills the other end
         spots = self._spots(label)[:: -1 if arm in self.arms[1:] else 1]
         return GraspRequest(f"{EASIEST} {label}", arm, exclude_near=(*self._stand, *left), place_choices=spots)

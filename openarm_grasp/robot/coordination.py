@@ -20,6 +20,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import Box
+from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 from openarm_grasp.robot.skills import Skills
 
@@ -174,14 +175,19 @@ class CoordinatedRobot:
             try:
                 return await work()
             except OpenArmError as error:
-                if (
-                    error.code not in (Code.IN_COLLISION, Code.NO_PLAN)
-                    or self._other_is_away()
-                    or self._robot.now_ns > end_ns
-                ):
+                if not self._in_the_way(error) or self._robot.now_ns > end_ns:
                     raise
                 if not await self._gone_on(what):
                     raise
+
+    def _in_the_way(self, error: OpenArmError) -> bool:
+        """Whether it may be the other arm that is in the way; what is refused for other things alone says so."""
+        if error.code not in (Code.IN_COLLISION, Code.NO_PLAN) or self._other_is_away():
+            return False
+        if error.code is Code.NO_PLAN or not isinstance(error, NoWayError):
+            return True
+        reasons = (error.message, *(one.reason for one in error.refusals.values()))
+        return any(link in reason for link in self._robot.description.links_of(self._other) for reason in reasons)
 
     async def _gone_on(self, what: str) -> bool:
         """Wait until the other arm has gone on; false when it waits for this one, and this one is to give way."""

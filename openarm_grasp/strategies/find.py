@@ -83,7 +83,8 @@ async def find_grasp(run: Run, why: str) -> tuple[Grasp, Planned | None, str]:
         except NoGraspError as error:
             run.fail(error.code, error.message)
             run.plans_failed += 1
-            if run.plans_failed >= run.config.limits.plan_attempts:
+            # next to another request that is carried out there may be other things to do
+            if run.plans_failed >= run.config.limits.plan_attempts or len(run.task.session.runs) > 1:
                 raise
             run.forget()
             why = error.message

@@ -11,7 +11,9 @@ import pytest
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Frame
+from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.robot.coordination import ArmCoordination, CoordinatedRobot
 from openarm_grasp.robot.interface import Frames
 from tests.refusals import refused
@@ -29,7 +31,7 @@ class Robot:
         for arm in ("left", "right"):
             self.q |= self.description.group_state(f"{arm}_arm", config.home_state)
         self.on_step: Callable[[int], None] = lambda step: None
-        self.faults: list[Code] = []
+        self.faults: list[Code | OpenArmError] = []
         self.moves: list[str] = []
         self.warnings: list[str] = []
 
@@ -50,7 +52,8 @@ class Robot:
 
     async def plan(self, effect: object) -> str:
         if self.faults:
-            raise OpenArmError(self.faults.pop(0), "the other arm is in the way")
+            fault = self.faults.pop(0)
+            raise fault if isinstance(fault, OpenArmError) else OpenArmError(fault, "the other arm is in the way")
         return "plan"
 
     async def move(self, arm: str, to: object, *_: object, **__: object) -> None:
@@ -104,6 +107,20 @@ def test_what_is_not_the_other_arms_doing_is_reported_at_once() -> None:
     with pytest.raises(OpenArmError):
         run(link(robot, "left").plan(None))  # type: ignore[arg-type]
     assert robot.steps == 0
+
+
+@pytest.mark.parametrize(("meets", "waits"), [("detected/orange_0", False), ("openarm_right_link5", True)])
+def test_a_plan_that_other_things_are_in_the_way_of_is_not_tried_again_when_the_arm_has_gone_on(meets, waits) -> None:
+    robot = Robot()
+    robot.away("right")
+    refusals = {"a": Verdict(Code.UNREACHABLE, "too far"), "b": Verdict(Code.IN_COLLISION, f"link7 would hit {meets}")}
+    robot.faults = [NoWayError(Code.IN_COLLISION, "a: link6 would hit detected/red_1", refusals)]
+    robot.on_step = lambda step: robot.away("right", 0.2)
+    if waits:
+        assert run(link(robot, "left").plan(None)) == "plan"  # type: ignore[arg-type]
+    else:
+        refused("red_1", run, link(robot, "left").plan(None))  # type: ignore[arg-type]
+    assert robot.steps == waits
 
 
 def test_of_two_arms_that_wait_for_each_other_the_right_one_gives_way() -> None:

@@ -555,3 +555,17 @@ def test_what_a_hand_still_holds_is_put_down_when_the_other_arm_has_ended() -> N
         assert (placing.phase, placing.arm, order.next()) == ("place", "auto", None)
         order.done(placing, Code.OK, "", placed=(0.2, 0.1))
     assert {order.next().arm, order.next().arm} == {"left", "right"}
+
+
+def test_what_other_things_keep_an_arm_from_is_asked_of_it_again_when_anything_has_been_moved() -> None:
+    order = Order(("anything",), arms=ARMS)
+    left, right = order.next(), order.next()
+    order.done(right, Code.IN_COLLISION, "orange is in the way", seen=(0.3, -0.3, 0.4))
+    other = order.next()
+    assert (other.arm, other.exclude_near) == ("right", ((0.3, -0.3),))
+    order.done(other, Code.UNREACHABLE, "too far", seen=(0.3, 0.4, 0.4))
+    order.done(left, Code.OK, "", placed=(0.2, 0.1), seen=(0.3, 0.2, 0.4), touched=True)
+    assert {ask.arm: ask.exclude_near for ask in (order.next(), order.next())} == {
+        "left": ((0.2, 0.1),),
+        "right": ((0.2, 0.1), (0.3, 0.4)),
+    }
