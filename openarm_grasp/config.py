@@ -146,12 +146,6 @@ class DetectConfig(Config):
     frame_timeout: float = Field(
         default=5.0, gt=0.0, le=60.0, description="wait for the frames of one round, wall clock, s"
     )
-    match_radius: float = Field(
-        default=0.03,
-        gt=0.0,
-        le=0.1,
-        description="sights of one object, where its detector gives no ids, m",
-    )
 
 
 class NearLookConfig(Config):

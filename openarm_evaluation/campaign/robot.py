@@ -44,7 +44,7 @@ from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.stereo import stereo_depth
 from openarm_evaluation.judging.judge import Sample
 from openarm_grasp.perception.boxes import with_points
-from openarm_grasp.perception.detections import Frame
+from openarm_grasp.perception.detections import Frame, Ids
 from openarm_motion.config import FaultsConfig, MotionConfig
 from openarm_motion.planning.arm import Arm
 from openarm_motion.service.motion_service import MotionService, make_arms, table_box
@@ -194,6 +194,7 @@ class SimRobot:
         self.held: tuple[HeldBox, ...] = ()
         #: What the detector of each camera follows.
         self._objects = {name: Objects(one.objects) for name, one in suite.detectors.items()}
+        self._ids = {name: Ids() for name in suite.detectors}
         self._observing = ""
         self._detected_ns = -(10**12)
         self.table = table or scene.table
@@ -352,7 +353,8 @@ class SimRobot:
             return Frame(stamp_ns, perceived.boxes, cloud.moved(T_base_camera))
         shapes = self._silhouette.shapes(self.states.latest()[1], self.held)
         outline = self._silhouette.outline(optics, T_base_camera, shapes)
-        return with_points(Frame(stamp_ns, perceived.boxes), optics, T_base_camera, self.table.top_z, outline)
+        frame = self._ids[name].given(Frame(stamp_ns, perceived.boxes))
+        return with_points(frame, optics, T_base_camera, self.table.top_z, outline)
 
     def _carriers(self, stamp_ns: int) -> Mapping[str, Carrier] | None:
         """What the hands hold at the stamp of an image; None when their posture is not known."""

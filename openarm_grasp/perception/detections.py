@@ -93,21 +93,16 @@ class UntrustedError(OpenArmError):
 
 
 class Ids:
-    """Ids for detections of a detector that follows nothing: that of the nearest one of its label before.
+    """Ids for detections of a detector that follows nothing: that of the nearest one of its label before."""
 
-    Args:
-        radius: Greatest distance between two sights of one object, m.
-    """
-
-    def __init__(self, radius: float) -> None:
-        self._radius = radius
+    def __init__(self) -> None:
         self._known: dict[str, Detection] = {}
 
     def given(self, frame: Frame) -> Frame:
         """Return a frame with an id for each detection; one that its detector has given stays."""
         free, named = dict(self._known), list[Detection]()
         for d in frame.detections:
-            alike = [name for name, known in free.items() if known.label == d.label and apart(d, known) <= self._radius]
+            alike = [name for name, known in free.items() if known.label == d.label and apart(d, known) <= NEXT_TO]
             name = d.id or min(alike, key=lambda name: apart(d, free[name]), default=f"~{len(self._known)}")
             free.pop(name, None)
             named.append(d if d.id else replace(d, id=name))

@@ -141,9 +141,9 @@ class GraspSession:
 
     def staying(self, run: Run, others: Sequence[Detection]) -> tuple[Detection, ...]:
         """Return objects without those that other hands are at; the map knows when they have been lifted."""
-        held = [r.seen_at for r in self.runs if r is not run and r.hand is not Hand.FREE and r.seen_at is not None]
-        radius = self.context.config.detect.match_radius
-        return tuple(d for d in others if all(math.dist(d.p_base[:2], p[:2]) > radius for p in held))
+        taken = [r.findings.sighting for r in self.runs if r is not run and r.hand is not Hand.FREE]
+        held = {one.target.id for one in taken if one is not None}
+        return tuple(d for d in others if d.id not in held)
 
     def check_hands(self, robot: Skills, request: GraspRequest) -> None:
         """Refuse what would drop an object that an ended request left in a hand; forget one that is gone.

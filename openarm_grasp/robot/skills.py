@@ -8,7 +8,6 @@ does not succeed.
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import replace
 from math import inf
 from typing import Literal
 
@@ -22,7 +21,7 @@ from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
 from openarm_grasp.evidence.verdicts import Evidence, learn_command
-from openarm_grasp.perception.detections import Frame, Ids, Sighting, in_base
+from openarm_grasp.perception.detections import Frame, Sighting, in_base
 from openarm_grasp.planning.candidates import (
     UP,
     Box,
@@ -106,8 +105,7 @@ class Skills:
     async def observe(self, count: int, *, near: str = "") -> Frames:
         """Frames of detections that are taken from now on, by the camera over the table, or by one on a hand."""
         self.robot.check()
-        seen, ids = await self.robot.observe(count, near=near), self._near_ids if near else self.ids
-        return replace(seen, frames=tuple(map(ids.given, seen.frames)))
+        return await self.robot.observe(count, near=near)
 
     def expect_near(self, camera: str) -> None:
         """Announce an observation by the camera on the hand."""

@@ -9,6 +9,7 @@ only while a grasp runs, detections only in states that observe.
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -33,7 +34,7 @@ from openarm_common.ros.tf import RobotStateListener
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import Silence
 from openarm_grasp.perception.boxes import with_points
-from openarm_grasp.perception.detections import Frame, in_base
+from openarm_grasp.perception.detections import Frame, Ids, in_base
 from openarm_grasp.robot.interface import Frames
 from openarm_grasp.ros.pad_listener import Pads
 
@@ -72,6 +73,8 @@ class GraphClients:
         self._clouds: dict[int, PointCloud2] = {}
         self._topic = DETECTIONS
         self._frames: list[Frame] = []
+        #: Ids for detections that have none, by topic.
+        self._ids = defaultdict[str, Ids](Ids)
         self._frame_id = node.description.base
         self._observing_since_ns = 0
         self._next_tick = Future()
@@ -252,7 +255,7 @@ class GraphClients:
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
         base = self._node.description.base
         frames = in_base(self._frames[-count:], lambda t_ns: self.robot.buffer.lookup(base, self._frame_id, t_ns))
-        return Frames(tuple(self._with_cloud(frame, camera) for frame in frames), base)
+        return Frames(tuple(self._with_cloud(self._ids[topic].given(frame), camera) for frame in frames), base)
 
     def listen(self, topic: str) -> None:
         """Let a detector begin: the first frame comes up to 1.5 s later, as its camera rests without a subscriber."""

@@ -16,12 +16,11 @@ from functools import partial
 
 import numpy as np
 
-from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.evidence.camera import judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict, Verdict, judge_lift
-from openarm_grasp.perception.detections import apart
-from openarm_grasp.perception.sightings import first_points, object_points
+from openarm_grasp.perception.detections import Frame, apart
+from openarm_grasp.perception.sightings import first_points
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import other_spots, place_targets
@@ -290,7 +289,9 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
         # of what is no box or cylinder more is known after the lift; and a person confirms what is planned
         if run.request.phase == "all" and not (grasp.of_cloud or run.request.confirm):
             with suppress(OpenArmError):  # it is planned from where the arm then is
-                run.place_plan = await robot.plan_place(arm, grasp.places, sighting, grasp.candidate, plan.retreat)
+                run.place_plan = await robot.plan_place(
+                    arm, grasp.places, grasp.sighting, grasp.candidate, plan.retreat
+                )
 
     async def watched() -> None:
         seen.extend(await robot.observe_towards_end(rise, lambda: sag() <= _ARRIVING, _LIFT_FRAMES))
@@ -401,7 +402,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
 
 async def _carry(
     run: Run, grasp: Grasp, plan: Planned, target: PlaceTarget, *, last: bool
-) -> tuple[GripperVerdict, Verdict | None]:
+) -> tuple[HandVerdict, Verdict | None]:
     """Carry the object to its place and put it down; judge by the gripper as the hand comes to the line down.
 
     What meets something a little above the place is let go there, at the last try anywhere.
@@ -414,7 +415,7 @@ async def _carry(
             higher up, and may be put back yet.
     """
     arm, robot, config = grasp.arm, run.robot, run.config
-    found, lost = list[GripperVerdict](), list[OpenArmError]()
+    found, lost = list[HandVerdict](), list[OpenArmError]()
     line = float(np.linalg.norm(target.approach_offset))
 
     def above() -> bool:

@@ -31,7 +31,7 @@ def frames(*detections: tuple[Detection, ...], ids: Ids | None = None) -> list[F
 
 
 def followed(seen: Iterable[Frame], ids: Ids | None = None) -> list[Frame]:
-    return list(map((ids or Ids(0.03)).given, seen))
+    return list(map((ids or Ids()).given, seen))
 
 
 def look(seq, label="red", **kwargs):
@@ -107,7 +107,7 @@ def test_what_is_known_of_an_object_outlives_the_average():
 @pytest.mark.requirement("R-18")
 def test_the_same_object_is_followed_wherever_it_is_and_not_its_twin():
     """The words would choose the other one; what stood next to it and still does is not it."""
-    a, b, ids = seen(x=0.20), seen(x=0.32), Ids(0.03)
+    a, b, ids = seen(x=0.20), seen(x=0.32), Ids()
     before = look(frames((a, b), ids=ids))
     moved = seen(x=0.50)
     assert look(frames((b, moved), ids=ids), same=before).target.p_base[0] == pytest.approx(0.50)

@@ -109,7 +109,7 @@ def test_a_place_that_is_none_is_refused_with_what_is_in_view(others, name: str,
 def test_what_carries_an_object_is_another_one_and_not_beside_it():
     cube = thing("red", (0.3, 0.1, TABLE + 0.12), (0.045, 0.045, 0.045))
     next_to = thing("green", (0.4, 0.25, TABLE), (0.05, 0.05, 0.3))
-    frames = [Ids(0.03).given(Frame(k, (cube, BOX, next_to))) for k in range(3)]
+    frames = [Ids().given(Frame(k, (cube, BOX, next_to))) for k in range(3)]
     seen = find(frames, "red", CONFIG.detect)
     assert {one.label for one in seen.others} == {"blue", "green"}
     assert [one.label for one in seen.beside] == ["green"]

@@ -52,7 +52,7 @@ def test_what_is_grasped_of_several_that_fit_follows_from_the_policy(tabletop, p
         tabletop.Thing("blue", "cylinder", (0.066, 0.066, 0.115), 0.305, 0.035),
     ]
     seen = tabletop.render(things).perceived(Pipeline(pipeline.detector, pipeline.localizer, policy))
-    assert find([Ids(0.03).given(Frame(0, seen.boxes))], "cube", DetectConfig()).target.label == first
+    assert find([Ids().given(Frame(0, seen.boxes))], "cube", DetectConfig()).target.label == first
 
 
 def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None:
