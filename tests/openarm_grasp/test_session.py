@@ -250,7 +250,7 @@ def test_a_request_never_takes_what_another_one_is_at_or_puts_down(world) -> Non
 
 def test_what_another_hand_is_about_to_lift_is_no_obstacle(world) -> None:
     other = next_to(world, "red")
-    other.seen_at = world.objects["red"].p_base
+    other.findings.sighting = Sighting(replace(world.objects["red"], id="red"), (), 0)
     for hand, expected in ((Hand.FREE, {"detected/red"}), (Hand.AT_OBJECT, set())):
         other.hand = hand
         world.log.clear()
