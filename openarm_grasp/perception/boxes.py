@@ -41,12 +41,14 @@ def points_of(
 ) -> LabelledCloud:
     """Return the points that a camera would see of boxes, labelled by their number from 1, and of the table.
 
+    What is round is an upright cylinder. Of what was seen in part, and what is behind it, there are none.
+
     Args:
-        boxes: All that is on the table.
+        boxes: All that stands there.
         lens: Intrinsics of the camera.
         T_base_camera: (4, 4) optical frame.
         table_z: Height of the table top.
-        robot: (h, w) pixels in which the robot hides what is behind it; None: none.
+        robot: (h, w) pixels in which the robot may hide the table; None: none.
     """
     x, y = np.meshgrid(*lens.rays)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ T_base_camera[:3, :3].T
@@ -57,19 +59,27 @@ def points_of(
         for number, box in enumerate(boxes, start=1):
             T_camera_box = se3.inverse(T_base_camera) @ box.T_base_object
             where = _window(lens, se3.apply(T_camera_box, _CORNERS * box.size))
-            planes = np.stack([-0.5 * box.size, 0.5 * box.size])[:, None, None]
-            R = box.T_base_object[:3, :3]
-            ends = (planes - (camera - box.p_base) @ R) / (rays[where] @ R)
+            to_unit = box.T_base_object[:3, :3] / (0.5 * box.size)  # a cube, or a cylinder, between -1 and 1
+            start, along = (camera - box.p_base) @ to_unit, rays[where] @ to_unit
+            ends = (np.array([-1.0, 1.0])[:, None, None, None] - start) / along
+            if box.round:
+                ends[..., 0] = ends[..., 1] = _through_circle(start[:2], along[..., :2])
             enter, leave = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
             hit = (enter > 0.0) & (enter <= leave) & (enter < depth[where])
             depth[where][hit], labels[where][hit] = enter[hit], number
-    kept = labels > 0
-    kept[::_STEP, ::_STEP] = True
-    kept &= np.isfinite(depth)
+    kept = (labels == 0) & np.isfinite(depth)
     if robot is not None:
         kept &= ~robot
+    kept[1::_STEP] = kept[:, 1::_STEP] = False
+    kept |= np.array([False, *(box.measured for box in boxes)])[labels]  # what was measured is in view
     points = camera + depth[kept, None] * rays[kept]
     return LabelledCloud(points.astype(np.float32), labels[kept], camera, measured=False)
+
+
+def _through_circle(start: Array, along: Array) -> Array:
+    """Where rays (h, w, 2) from a point (2,) enter and leave the unit circle, (2, h, w); NaN where they miss it."""
+    a, b, c = (along**2).sum(axis=-1), along @ start, start @ start - 1.0
+    return (np.array([-1.0, 1.0])[:, None, None] * np.sqrt(b * b - a * c) - b) / a
 
 
 def _window(lens: Intrinsics, corners: Array) -> tuple[slice, slice]:

@@ -113,6 +113,14 @@ def test_what_the_robot_hides_has_not_moved_and_has_not_gone() -> None:
     assert judge_gone(points(upright(box())), [hidden]).code is Code.STALE_DATA
 
 
+@pytest.mark.requirement("N-03")
+def test_of_what_is_seen_in_part_nothing_is_known() -> None:
+    in_part = replace(box(size=(0.03, 0.03, 0.03)), measured=False)
+    hidden = with_points(Frame(1, (in_part,)), LENS, T_CAMERA, TABLE_Z, np.ones((LENS.height, LENS.width), np.bool_))
+    assert not len(hidden.cloud.points)
+    assert judge_unmoved(points(upright(box())), [hidden])[0]
+
+
 # --- after the lift
 @IMAGES
 @pytest.mark.parametrize(
@@ -240,6 +248,17 @@ def test_a_camera_sees_the_near_faces_of_boxes_and_the_table_around() -> None:
     assert cloud.points[cloud.labels == 0, 2] == pytest.approx(TABLE_Z, abs=1e-5)
     assert np.count_nonzero(cloud.labels == 0) > 10_000
     assert cloud.camera == pytest.approx(SLANTED)
+
+
+def test_what_is_round_is_seen_as_a_cylinder() -> None:
+    can = replace(box(size=TALL), size=np.array([0.06, 0.06, 0.1]), round=True)
+    cloud = points_of((can,), LENS, T_CAMERA, TABLE_Z)
+    local = se3.apply(se3.inverse(can.T_base_object), cloud.points[cloud.labels == 1])
+    off = np.linalg.norm(local[:, :2], axis=1) / 0.03
+    assert off.max() < 1.0 + 1e-3
+    on_top = np.abs(local[:, 2] - 0.05) < 1e-4
+    assert off[~on_top] == pytest.approx(1.0, abs=1e-3)
+    assert 0.2 < on_top.mean() < 0.8
 
 
 def test_what_nothing_else_is_known_of_has_the_shape_of_its_box() -> None:
