@@ -162,7 +162,7 @@ class World(Skills):
         self.robot = self  # type: ignore[assignment]
         self._target, self._turn, self._label, self._line = np.zeros(3), 0.0, "", np.zeros(3)
         self._object: Detection | None = None
-        self._went = np.zeros(3)
+        self._went, self._width = np.zeros(3), 0.0
 
     # --- running
     def grasp(self, label: str = "red", **kwargs: Any) -> GraspOutcome:
@@ -175,7 +175,7 @@ class World(Skills):
         """Pick and place with one arm, which must end with a code and a text in the message."""
         outcome = self.grasp(label, **kwargs)
         assert outcome.code is code, outcome.message
-        assert text in outcome.message
+        assert text in outcome.message, outcome.message
         return outcome
 
     def succeeds(self, label: str = "red", **kwargs: Any) -> GraspOutcome:
@@ -287,7 +287,7 @@ class World(Skills):
             return answer
         if isinstance(request, PlanGrasp):
             self._reach(request.arm, request.candidates[0].T_base_tcp[:2, 3])
-            self._label = request.target[0].id.removeprefix("target/")
+            self._label, self._width = request.target[0].id.removeprefix("target/"), request.candidates[0].width
             return self._planned(0, "transfer", "" if request.blend else "approach", "lift")
         within = [i for i, way in enumerate(request.targets) if self.reaches(request.arm, way.position)]
         if not within:
@@ -406,7 +406,7 @@ class World(Skills):
             self.slips, self.gap = max(0, self.slips - 1), 0.0
         else:
             self.held, self._object = self._label, self.objects[self._label]
-            self.gap = float(self._object.size[0])
+            self.gap = self._width
 
     def push(self) -> None:
         self.pushed += 1

@@ -81,7 +81,7 @@ def test_the_object_rises_with_the_hand_and_is_not_dragged_when_it_leaves(record
 @pytest.mark.requirement("P-07", "N-05")
 def test_an_object_that_slips_along_the_fingers_is_put_back_and_taken_otherwise(recorded: Recordings) -> None:
     """For a moment of the lift there is hardly any friction: the fingers stay where they are, the object does not."""
-    robot = bench(recorded)
+    robot = bench(recorded, clouds=True)
 
     def slippery() -> None:
         tick()
@@ -103,7 +103,7 @@ def test_an_object_that_slips_along_the_fingers_is_put_back_and_taken_otherwise(
     slipped = np.diff((watched.p_tcp - watched.p_object)[[lift[0], lift[-1]], 2])[0]
     assert 0.02 < slipped < 0.04
     failed = next(step for step in robot.steps if step.state == "RESET")
-    assert "slipped by at least" in failed.reason
+    assert "it has turned or slipped in the hand: it reaches" in failed.reason
     assert outcome.success, outcome.message
     assert outcome.attempts == 2
     first, second = (step.reason for step in robot.steps if step.reason.startswith("grasp blue/"))
