@@ -399,8 +399,12 @@ class Order:
             self.left = [one for one in self.left if one.label != label]
 
     def _none_left(self, label: str, arm: str, code: Code, message: str) -> Left | None:
-        """Nothing more of a label is in view besides what was left; what was left before and is out of view is, too."""
-        self._asked.add((label, arm))
+        """Nothing more of a label is in view besides what was left; what was left before and is out of view is, too.
+
+        What one arm does not see, with the other at home, the other does not see either, besides what the first left.
+        """
+        mine = any((one.label, one.arm) == (label, arm) for one in self.left)
+        self._asked.add((label, arm if mine else _ANY_ARM))
         if not self._exhausted(label, _ANY_ARM) or any(one.label == label for one in self.left):
             return None
         gone = (one for one in self._before if one.label == label and one.where is not None)

@@ -521,14 +521,30 @@ def test_what_one_arm_cannot_take_is_left_when_the_other_cannot_either_and_liste
     assert crew.order.outcome == "PARTIAL"
 
 
-def test_what_nothing_was_seen_of_by_one_arm_is_asked_of_the_other_before_an_order_ends() -> None:
+def test_what_one_arm_could_not_take_is_asked_of_the_other_when_the_first_sees_nothing_else() -> None:
     order = Order(("anything",), arms=ARMS)
     left, right = order.next(), order.next()
     assert (left.arm, right.arm, order.next()) == ("left", "right", None)
-    assert order.done(left, Code.UNKNOWN_OBJECT, "the other arm hides it") is None
+    order.done(left, Code.UNREACHABLE, "too far", seen=(0.3, -0.3, 0.4))
+    again = order.next()
+    assert (again.arm, again.exclude_near) == ("left", ((0.3, -0.3),))
+    assert order.done(again, Code.UNKNOWN_OBJECT, "no more") is None
     assert order.next() is None
     order.done(right, Code.OK, "", placed=(0.2, 0.1), seen=(0.3, 0.0), touched=True)
-    assert order.next().arm == "right"
+    last = order.next()
+    assert (last.arm, last.exclude_near) == ("right", ((0.2, 0.1),))
+    order.done(last, Code.OK, "", placed=(0.2, 0.2), seen=(0.3, -0.3), touched=True)
+    order.done(order.next(), Code.UNKNOWN_OBJECT, "no more")
+    assert (order.next(), order.outcome, order.placed) == (None, "SUCCESS", ["anything"] * 2)
+
+
+def test_what_one_arm_sees_nothing_besides_is_not_looked_for_by_the_other_again() -> None:
+    order = Order(("anything",), arms=ARMS)
+    left, right = order.next(), order.next()
+    order.done(left, Code.UNKNOWN_OBJECT, "nothing besides what the right arm is at")
+    assert order.next() is None
+    order.done(right, Code.OK, "", placed=(0.2, 0.1), seen=(0.3, 0.0), touched=True)
+    assert (order.next(), order.outcome, order.faults()) == (None, "SUCCESS", ())
 
 
 def test_no_more_objects_are_asked_for_at_once_than_are_wanted() -> None:
