@@ -3,9 +3,9 @@
 
 Each word must be an attribute of the object (its name, colour or shape), or choose among those that fit; a relation
 compares it with another object that is described in the same way. No word is known beforehand: the attributes of what
-is in view are the vocabulary. The easiest object lies under nothing, has room around it, and is seen surely. Capitals
-and punctuation make no difference. Sides are those of the robot's view: left is +y of the base frame, right -y, behind
-+x, in front -x.
+is in view are the vocabulary. The easiest object lies under nothing, has room around it, and is seen surely; an easy
+one about so ("leftmost easy can"). Capitals and punctuation make no difference. Sides are those of the robot's view:
+left is +y of the base frame, right -y, behind +x, in front -x.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ _RELATIONS: Mapping[Words, tuple[float, float] | None] = {
     ("closest", "to"): None,
 }
 #: Chooses what needs the least to be taken.
-EASIEST = "easiest"
+EASIEST, EASY = "easiest", "easy"
 _CHOICES: Mapping[str, Callable[[Detection, Sequence[Detection]], float]] = {
     EASIEST: lambda one, others: _trouble(one, others),
+    EASY: lambda one, others: round(_trouble(one, others)),
     "largest": lambda one, _: -float(np.prod(one.size)),
     "biggest": lambda one, _: -float(np.prod(one.size)),
     "smallest": lambda one, _: float(np.prod(one.size)),
@@ -165,11 +166,11 @@ def _reach(one: Detection, others: Sequence[Detection], side: tuple[float, float
 
 
 def _trouble(one: Detection, detections: Sequence[Detection]) -> float:
-    """How hard an object is to take, in tenths: what lies over it counts most, then neighbours, then an unsure box.
+    """How hard an object is to take: what lies over it counts most, then neighbours, then a box that is unsure.
 
     Fingers go down to about the middle of an object: what is lower is in no way.
     """
     higher = [(gap(one, other), other.top) for other in detections if other is not one and other.top > one.p_base[2]]
     under = sum(distance < _TOUCHING and top > one.top + _HIGHER for distance, top in higher)
     crowd = 1.0 - min([_ROOM, *(distance for distance, _ in higher)]) / _ROOM
-    return round(2.0 * under + crowd + (1.0 - one.score) + 4.0 * (not one.measured), 1)
+    return 2.0 * under + crowd + (1.0 - one.score) + 4.0 * (not one.measured)

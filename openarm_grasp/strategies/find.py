@@ -14,7 +14,7 @@ import numpy as np
 from openarm_common.detection import Detection, gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.hand import HandParts
-from openarm_common.wanted import EASIEST, describe
+from openarm_common.wanted import EASIEST, EASY, describe
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import (
     NEXT_TO,
@@ -186,15 +186,16 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
 
 
 def _beside_others(run: Run) -> GraspRequest:
-    """The request, for what no other one is at; of the easiest, an arm by name takes the outermost on its side first.
+    """The request, for what no other one is at.
 
-    Two arms come together last so, when either may take what is left.
+    For the easiest an arm by name takes the outermost easy one on its side: the arms come together last.
     """
     request, shoulders = run.task.session.beside(run, run.request), run.context.shoulders
     side = sides(request.arm, shoulders) if request.arm in shoulders else ()
     if len(side) != 1 or not request.label.startswith(EASIEST):
         return request
-    return replace(request, label=f"{'leftmost' if side[0] > 0.0 else 'rightmost'} {request.label}")
+    outermost = f"{'leftmost' if side[0] > 0.0 else 'rightmost'} {EASY}"
+    return replace(request, label=request.label.replace(EASIEST, outermost, 1))
 
 
 def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ...]:

@@ -121,6 +121,7 @@ def test_the_easiest_lies_under_nothing_and_has_room() -> None:
     hidden = replace(thing("white", "box", 0.2, -0.3), measured=False)
     assert select("easiest anything", (hidden, under, beside, over, alone)) == (over, alone, beside, under, hidden)
     assert select("easiest largest thing", (under, over))[0] is over
+    assert select("leftmost easy thing", (beside, over, alone, under)) == (alone, over, beside, under)
     assert select("easiest red", (under, over)) == (under,)
 
 
