@@ -221,7 +221,9 @@ def free_spots(
 def clear_spots(
     spots: Iterable[Sequence[float]], target: Detection, others: Sequence[Detection], config: PlaceConfig
 ) -> list[tuple[float, float, float, float]]:
-    """Spots that keep their distance from other objects and from where the object came from.
+    """Spots that keep their distance from the middles of other objects and from where the object came from.
+
+    It is not over their outlines there, turned as it fits.
 
     Args:
         spots: (x, y) of each, base frame, m.
@@ -235,13 +237,13 @@ def clear_spots(
     """
     found: list[tuple[float, float, float, float]] = []
     xys = np.array([[float(spot[0]), float(spot[1])] for spot in spots])
-    outlines = [distances_from(d, xys) + _LARGE for d in others]  # of what is large the middle may be far
-    edges = np.min([np.full(len(xys), inf), *outlines], axis=0)
-    for (x, y), edge in zip(xys.tolist(), edges.tolist(), strict=True):
+    outlines = np.min([np.full(len(xys), inf), *(distances_from(d, xys) for d in others)], axis=0)
+    least = 0.5 * float(min(target.size[:2])) + _NEXT
+    for (x, y), outline in zip(xys.tolist(), outlines.tolist(), strict=True):
         origin = hypot(x - target.p_base[0], y - target.p_base[1])
-        clearance = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
-        clearance = min(clearance, edge)
-        if origin >= config.origin_distance and clearance >= config.neighbour_distance:
+        middle = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
+        if origin >= config.origin_distance and middle >= config.neighbour_distance and outline >= least:
+            clearance = min(middle, outline + _LARGE)  # of what is large the middle may be far
             found.append((origin - min(clearance, 2.0 * config.neighbour_distance), clearance, x, y))
     return found
 
