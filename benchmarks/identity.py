@@ -46,7 +46,7 @@ from openarm_evaluation.campaign.tasks.things import object_sources
 from openarm_evaluation.judging.identity import IdentityScore
 from openarm_perception.detection.clouds import smooth_depth
 from openarm_perception.geometry.depth import DepthLimits, View
-from openarm_world.carried import Carrier
+from openarm_world.carried import HeldBoxes
 from openarm_world.objects import Objects
 from openarm_world.shares import explain
 
@@ -65,7 +65,7 @@ class Look:
     view: DepthView
     cloud: LabelledCloud
     body: Ints
-    held: Mapping[str, Carrier]
+    held: Mapping[str, HeldBoxes]
 
 
 class Lab(SimRobot):
@@ -92,7 +92,7 @@ class Lab(SimRobot):
     def _top(self) -> float:
         return self.table.top_z + _OVER
 
-    def look(self, held: Mapping[str, Carrier], rng: np.random.Generator, hide: bool = False) -> Look:
+    def look(self, held: Mapping[str, HeldBoxes], rng: np.random.Generator, hide: bool = False) -> Look:
         """Take an image of how things are."""
         self.images.clear()
         self._strip = None
@@ -129,7 +129,7 @@ class Lab(SimRobot):
         self.data.qvel[joint.dofadr[0] :][:6] = 0.0
         mujoco.mj_forward(self.model, self.data)
 
-    def carrier(self, name: str) -> dict[str, Carrier]:
+    def carrier(self, name: str) -> dict[str, HeldBoxes]:
         """The box of a thing, as a hand that holds it."""
         body, corners = self.model.body(name), list[Array]()
         for g in range(body.geomadr[0], body.geomadr[0] + body.geomnum[0]):
@@ -139,7 +139,7 @@ class Lab(SimRobot):
             corners.append(se3.apply(T, box))
         low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
         size = tuple((high - low).tolist())
-        return {name: Carrier(self.pose(name) @ se3.make(None, (low + high) / 2.0), size)}
+        return {name: HeldBoxes(self.pose(name), ((se3.make(None, (low + high) / 2.0), size),))}
 
     def close(self) -> None:
         """Free the renderer."""

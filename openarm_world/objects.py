@@ -21,7 +21,7 @@ from openarm_common import se3
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.labelled_cloud import LabelledCloud
 from openarm_common.types import Array, Ints
-from openarm_world.carried import Carrier, Grip, gripped, let_go, motions
+from openarm_world.carried import Grip, HeldBoxes, gripped, let_go, motions
 from openarm_world.config import WorldConfig
 from openarm_world.shares import FREE, HIDDEN, SEEN, explain, look
 
@@ -74,7 +74,7 @@ class Objects:
         tracks: The objects, oldest first.
         next_id: Number of the next one.
         t_ns: Stamp of the newest image.
-        grips: Grips of each carrier, by its name.
+        grips: Grips of each hand, by its name.
     """
 
     config: WorldConfig = field(default_factory=WorldConfig)
@@ -84,7 +84,7 @@ class Objects:
     grips: Mapping[str, Grip] = field(default_factory=dict[str, Grip])
 
     def update(
-        self, view: DepthView, cloud: LabelledCloud, t_ns: int, carriers: Mapping[str, Carrier] | None = None
+        self, view: DepthView, cloud: LabelledCloud, t_ns: int, carriers: Mapping[str, HeldBoxes] | None = None
     ) -> tuple[Objects, Sight]:
         """Return the objects after an image, and what it has said of them.
 
@@ -117,15 +117,15 @@ class Objects:
         owner = np.zeros(len(cloud.labels), np.int64)
         owner[cloud.labels > 0] = shown.owner
         grips = self.grips if carriers is None else gripped(self.grips, carriers, after, self.config.same)
-        waiting = [name for name, grip in grips.items() if not grip.ids]
+        waiting = {name: held.middle for name, held in (carriers or {}).items() if not grips[name].ids}
         # a hand that has closed since the last image holds what has left its place below it
         for t, name in _nearest(
             {t: np.median(moved[t].points[:, :2], axis=0) for t in lost},
-            {name: grips[name].T_base_box[:2, 3] for name in waiting},
+            {name: middle[:2] for name, middle in waiting.items()},
             self.config.gate,
         ):
             track, middle = moved[t], np.median(moved[t].points, axis=0)
-            after.append(replace(track, points=track.points + grips[name].T_base_box[:3, 3] - middle))
+            after.append(replace(track, points=track.points + waiting[name] - middle))
             grips = {**grips, name: replace(grips[name], ids=(track.id,))}
             lost.remove(t)
         tracks = tuple(sorted(after, key=lambda track: track.id))

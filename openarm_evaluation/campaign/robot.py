@@ -65,7 +65,7 @@ from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.stage import Stage
-from openarm_world.carried import Carrier, carriers
+from openarm_world.carried import HeldBoxes, carriers
 from openarm_world.objects import Objects
 
 T = TypeVar("T")
@@ -356,7 +356,7 @@ class SimRobot:
         frame = self._ids[name].given(Frame(stamp_ns, perceived.boxes))
         return with_points(frame, optics, T_base_camera, self.table.top_z, outline)
 
-    def _carriers(self, stamp_ns: int) -> Mapping[str, Carrier] | None:
+    def _carriers(self, stamp_ns: int) -> Mapping[str, HeldBoxes] | None:
         """What the hands hold at the stamp of an image; None when their posture is not known."""
         try:
             joints = self.states.joints_at(min(stamp_ns, self.states.latest()[0]))

@@ -10,7 +10,7 @@ from openarm_common.labelled_cloud import LabelledCloud
 from openarm_perception.detection.clouds import labelled_cloud, smooth_depth
 from openarm_perception.detection.pipeline import Perceived
 from openarm_perception.geometry.depth import DepthLimits, View
-from openarm_world.carried import Carrier
+from openarm_world.carried import HeldBoxes
 from openarm_world.objects import Objects
 
 
@@ -20,7 +20,7 @@ def followed(
     seen: View,
     limits: DepthLimits,
     t_ns: int,
-    carried: Mapping[str, Carrier] | None,
+    carried: Mapping[str, HeldBoxes] | None,
 ) -> tuple[Objects, Perceived, LabelledCloud]:
     """Return the objects after an image, what was detected in it with their ids, and its points in the optical frame.
 

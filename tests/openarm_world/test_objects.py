@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_world import Objects, Sight
-from openarm_world.carried import Carrier
+from openarm_world.carried import HeldBoxes
 from openarm_world.config import WorldConfig
 from tests.openarm_world.made import ABOVE, Box, clouds, image
 
@@ -45,6 +45,10 @@ class Run:
         self.objects, sight = self.objects.update(view, clouds(view, table[number]), self.t_ns, **more)
         self.sights.append(sight)
         return [sight.ids.get(int(i), "") for i in table[1 : len(boxes) + 1]]
+
+
+def held_box(T: np.ndarray, size: tuple[float, float, float]) -> HeldBoxes:
+    return HeldBoxes(T, ((np.eye(4), size),))
 
 
 def moved(box: Box, x: float, y: float = 0.0, z: float = 0.0) -> Box:
@@ -140,7 +144,7 @@ def test_what_a_hand_holds_moves_with_it_and_what_it_did_not_take_stays() -> Non
 
     def hand(x: float, z: float) -> dict[str, object]:
         T = se3.make(None, (A[0][0] + x, A[0][1], A[0][2] + z))
-        return {"carriers": {"held": Carrier(T, (0.06, 0.06, 0.06))}}
+        return {"carriers": {"held": held_box(T, (0.06, 0.06, 0.06))}}
 
     run.see(A, B, C)
     assert run.see(A, B, C, **hand(0.0, 0.0)) == ["1", "2", "3"]
@@ -148,31 +152,44 @@ def test_what_a_hand_holds_moves_with_it_and_what_it_did_not_take_stays() -> Non
         assert run.see(moved(A, x, 0.0, z), B, C, **hand(x, z)) == ["1", "2", "3"]
     assert run.see(moved(A, 0.28), B, C, **hand(0.28, 0.0)) == ["1", "2", "3"]
     assert run.see(moved(A, 0.28), B, C, carriers={}) == ["1", "2", "3"]  # it has let go
-    run.see(moved(A, 0.28), B, C, **{"carriers": {"held": Carrier(se3.make(None, B[0]), B[1])}})
-    gone = {"carriers": {"held": Carrier(se3.make(None, (0.0, 0.0, 0.5)), B[1])}}
+    run.see(moved(A, 0.28), B, C, **{"carriers": {"held": held_box(se3.make(None, B[0]), B[1])}})
+    gone = {"carriers": {"held": held_box(se3.make(None, (0.0, 0.0, 0.5)), B[1])}}
     assert run.see(moved(A, 0.28), B, C, **gone) == ["1", "2", "3"]  # slipped out of the hand: it stands
+
+
+def test_what_a_hand_holds_as_several_boxes_is_one_object() -> None:
+    run = Run()
+    third = (A[1][0] / 3.0, *A[1][1:])
+    parts = tuple((se3.make(None, (x, 0.0, 0.0)), third) for x in (-third[0], 0.0, third[0]))
+
+    def hand(z: float) -> dict[str, HeldBoxes]:
+        return {"hand": HeldBoxes(se3.make(None, moved(A, 0.0, 0.0, z)[0]), parts)}
+
+    assert run.see(A, B, carriers=hand(0.0)) == ["1", "2"]
+    assert run.objects.grips["hand"].ids == (1,)
+    assert run.see(moved(A, 0.0, 0.0, 0.2), B, carriers=hand(0.2)) == ["1", "2"]
 
 
 def test_what_a_hand_took_and_put_down_between_images_keeps_its_id() -> None:
     """The images come before the grasp, while the hand carries the thing out of view, and after it was put down."""
     run = Run()
     run.see(A, B)
-    held = {"held": Carrier(se3.make(None, (-0.1, 0.09, 0.25)), A[1])}
+    held = {"held": held_box(se3.make(None, (-0.1, 0.09, 0.25)), A[1])}
     hand: Box = ((-0.1, 0.09, 0.25), (0.1, 0.1, 0.1))
     assert run.see(B, over=(hand,), carriers=held) == ["2"]
     assert run.sights[-1].gone == ()
     assert run.see(B, over=(hand,), carriers=held) == ["2"]
     assert run.see(B, moved(A, 0.1, -0.15), carriers={}) == ["2", "1"]
-    run.see(B, moved(A, 0.1, -0.15), C, carriers={"held": Carrier(se3.make(None, (0.0, 0.2, 0.3)), A[1])})
+    run.see(B, moved(A, 0.1, -0.15), C, carriers={"held": held_box(se3.make(None, (0.0, 0.2, 0.3)), A[1])})
     assert run.sights[-1].gone == ()  # all stand: it holds something else
     assert run.sights[-1].born == (3,)
 
 
 def test_a_hand_whose_pose_is_not_known_for_an_image_goes_on_holding() -> None:
     run = Run()
-    run.see(A, B, carriers={"held": Carrier(se3.make(None, A[0]), A[1])})
+    run.see(A, B, carriers={"held": held_box(se3.make(None, A[0]), A[1])})
     run.see(B, carriers=None, over=(moved(ARM, 0.0),))
-    lifted = {"held": Carrier(se3.make(None, moved(A, 0.2, 0.0, 0.1)[0]), A[1])}
+    lifted = {"held": held_box(se3.make(None, moved(A, 0.2, 0.0, 0.1)[0]), A[1])}
     assert run.see(moved(A, 0.2, 0.0, 0.1), B, carriers=lifted) == ["1", "2"]
 
 
