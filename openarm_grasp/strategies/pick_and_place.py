@@ -10,18 +10,22 @@ Base frame, m.
 from __future__ import annotations
 
 import traceback
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.camera import judge_unmoved
+from openarm_grasp.evidence.camera import heavier_end, judge_gone, judge_held, judge_unmoved
 from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict, Verdict, judge_lift
+from openarm_grasp.perception.clouds import lifted, risen_points
 from openarm_grasp.perception.detections import Frame, apart
-from openarm_grasp.perception.sightings import first_points
+from openarm_grasp.perception.sightings import first_points, object_points, points_around
 from openarm_grasp.planning.candidates import PlaceTarget
+from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import other_spots, place_targets
 from openarm_grasp.requests.request import Feasible, GraspOutcome, GraspRequest, Proof
@@ -29,11 +33,11 @@ from openarm_grasp.requests.states import Hand, State
 from openarm_grasp.requests.task import Grasp, Placed, Task
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
-from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place
+from openarm_grasp.strategies.find import agreed, find_grasp, grasp_of, plan_place, regrasped
 from openarm_grasp.strategies.retreat import retreat, still_held
 from openarm_grasp.strategies.run import Run
 from openarm_grasp.strategies.second_look import second_look
-from openarm_grasp.strategies.verify import judge_lifted, verify
+from openarm_grasp.strategies.verify import verify
 
 #: After these another observation would wait for frames that do not come.
 _BLIND = (Code.NOT_READY, Code.STALE_DATA, Code.TIMEOUT)
@@ -301,7 +305,7 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
     frames = tuple(seen)
     evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
     gripper = grasp.judge(evidence, config.held, was_held=True)
-    grasp, camera = judge_lifted(run, grasp, frames)
+    grasp, camera = _judge_lifted(run, grasp, frames)
     verdict = judge_lift(gripper, camera)
     # what is hidden after the lift may be seen at the place
     hidden = bool(frames) and verdict.code is Code.STALE_DATA and run.request.phase == "all"
@@ -310,6 +314,35 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Grasp, 
         raise OpenArmError(verdict.code, verdict.reason)
     run.hand = Hand.CARRYING
     return grasp, gripper, camera, verdict.reason
+
+
+def _judge_lifted(run: Run, grasp: Grasp, frames: Sequence[Frame]) -> tuple[Grasp, CameraVerdict]:
+    """Judge by the camera whether the object has left its place, and hangs where the hand should hold it.
+
+    Args:
+        run: The request.
+        grasp: Hold of the hand on the object.
+        frames: Taken after the lift.
+
+    Returns:
+        The grasp, of all that has come along as one body, and the verdict.
+    """
+    sighting, T_before = grasp.sighting, grasp.candidate.T_base_tcp
+    T = run.robot.T_base_tcp(grasp.arm)
+    T_now_before = T @ se3.inverse(T_before)
+    points = risen_points(frames, sighting, run.config.held.rise)
+    thing = lifted(frames, sighting, points, T_now_before, T_before[:3, 3])
+    if thing is not sighting:
+        grasp = run.grasp = regrasped(run, grasp, thing)
+    gone = judge_gone(first_points(thing), frames)
+    if not gone.ok:
+        return grasp, gone
+    before = np.concatenate([object_points(sighting.clouds), points_around(sighting.clouds)])
+    held = judge_held(columns(before, run.context.table.top_z), points, T_now_before, run.config.held)
+    if held.ok:
+        return grasp, gone
+    run.grasp = grasp = replace(grasp, turned=True, heavy=heavier_end(object_points(thing.clouds), points, T))
+    return grasp, held
 
 
 # --- place

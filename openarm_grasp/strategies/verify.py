@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the camera says of an object that a hand has lifted, and, from home, of one that it has put down.
-
-Base frame, m.
-"""
+"""See, from home, whether an object is at the place where a hand has put it. Base frame, m."""
 
 from __future__ import annotations
 
@@ -17,26 +14,16 @@ from openarm_common.detection import gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.objects.resting import least_box_middles
 from openarm_common.types import Array
-from openarm_grasp.evidence.camera import (
-    AS_HIGH,
-    heavier_end,
-    judge_gone,
-    judge_held,
-    judge_moved,
-    judge_same,
-    stays,
-)
+from openarm_grasp.evidence.camera import AS_HIGH, judge_moved, judge_same, stays
 from openarm_grasp.evidence.verdicts import CameraVerdict
-from openarm_grasp.perception.clouds import came_next_to, lifted, risen_points, shown_at
+from openarm_grasp.perception.clouds import came_next_to, shown_at
 from openarm_grasp.perception.detections import NEXT_TO, Frame
-from openarm_grasp.perception.sightings import first_points, in_box, object_points, points_around
+from openarm_grasp.perception.sightings import first_points, in_box, points_around
 from openarm_grasp.planning.candidates import PlaceTarget
-from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.planning.place import placing_error, symmetry
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import Grasp, Placed
 from openarm_grasp.robot.skills import reraise_stop
-from openarm_grasp.strategies.find import regrasped
 
 if TYPE_CHECKING:
     from openarm_grasp.strategies.run import Run
@@ -48,35 +35,6 @@ _SEEN_WITHIN = 0.75
 _PART_WITHIN = 0.006
 #: Largest turn of a placed object from the yaw that was asked for, rad.
 _TURN_WITHIN = float(np.radians(15.0))
-
-
-def judge_lifted(run: Run, grasp: Grasp, frames: Sequence[Frame]) -> tuple[Grasp, CameraVerdict]:
-    """Judge by the camera whether the object has left its place, and hangs where the hand should hold it.
-
-    Args:
-        run: The request.
-        grasp: Hold of the hand on the object.
-        frames: Taken after the lift.
-
-    Returns:
-        The grasp, of all that has come along as one body, and the verdict.
-    """
-    sighting, T_before = grasp.sighting, grasp.candidate.T_base_tcp
-    T = run.robot.T_base_tcp(grasp.arm)
-    T_now_before = T @ se3.inverse(T_before)
-    points = risen_points(frames, sighting, run.config.held.rise)
-    thing = lifted(frames, sighting, points, T_now_before, T_before[:3, 3])
-    if thing is not sighting:
-        grasp = run.grasp = regrasped(run, grasp, thing)
-    gone = judge_gone(first_points(thing), frames)
-    if not gone.ok:
-        return grasp, gone
-    before = np.concatenate([object_points(sighting.clouds), points_around(sighting.clouds)])
-    held = judge_held(columns(before, run.context.table.top_z), points, T_now_before, run.config.held)
-    if held.ok:
-        return grasp, gone
-    run.grasp = grasp = replace(grasp, turned=True, heavy=heavier_end(object_points(thing.clouds), points, T))
-    return grasp, held
 
 
 async def verify(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]) -> CameraVerdict:
