@@ -59,6 +59,8 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
         rise: Its upper end is at least this much higher, of a prism its lower end, m.
     """
     before, target = object_points(sighting.clouds[-1:]), sighting.target
+    if not len(before):
+        return before
     place, top, middle = KDTree(before[:, :2]), _top(before), before.mean(axis=0)
     frame = next((frame for frame in reversed(frames) if frame.cloud is not None), None)
     found = [np.empty((0, 3))]

@@ -39,7 +39,7 @@ _CLOUDS = 3
 _MOST = 0.95
 #: What stands on another thing, or in it, begins so much higher than that, m.
 _STACKED = 0.005
-#: An object of fewer points has no cloud.
+#: An object of no known shape that has fewer points has no cloud.
 _LEAST_POINTS = 60
 
 
@@ -293,7 +293,7 @@ def _labelled(frame: Frame, detection: Detection) -> LabelledCloud | None:
     if frame.cloud is None:
         return None
     mine = frame.cloud.labels == frame.detections.index(detection) + 1
-    if np.count_nonzero(mine) < _LEAST_POINTS:
+    if np.count_nonzero(mine) < (1 if detection.kind else _LEAST_POINTS):
         return None
     labels = np.where(mine, 1, np.where(frame.cloud.labels > 0, 2, 0))
     return replace(frame.cloud, labels=labels.astype(np.uint32))

@@ -336,7 +336,7 @@ def _judge_lifted(run: Run, grasp: Grasp, frames: Sequence[Frame]) -> tuple[Gras
         grasp = run.grasp = regrasped(run, grasp, thing)
     gone = judge_gone(first_points(thing), frames)
     if not gone.ok:
-        return grasp, gone
+        return grasp, gone  # also where no points of it are known
     before = np.concatenate([object_points(sighting.clouds), points_around(sighting.clouds)])
     held = judge_held(columns(before, run.context.table.top_z), points, T_now_before, run.config.held)
     if held.ok:

@@ -189,6 +189,16 @@ def test_a_placed_object_that_the_detector_misses_in_one_frame_is_placed(world, 
     assert world.succeeds().attempts == 1
 
 
+@pytest.mark.requirement("P-08", "P-09")
+@pytest.mark.parametrize("phase", ["pick", "all"])
+def test_a_camera_whose_place_is_not_known_says_nothing_and_nothing_is_said_to_be_done(world, phase):
+    real = world.frames
+    world.frames = lambda count: Frames(tuple(replace(one, cloud=None) for one in real(count).frames), "base")
+    outcome = world.grasp(phase=phase)
+    assert outcome.code is Code.STALE_DATA
+    assert "nothing shows whether it has gone" in outcome.message or "no points of what stands" in outcome.message
+
+
 @pytest.mark.requirement("P-08")
 def test_held_but_still_seen_in_its_place_is_put_back(world):
     """The hand has something, but the camera says it is not the object: no success, and nothing is dropped."""
