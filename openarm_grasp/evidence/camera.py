@@ -21,7 +21,7 @@ from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict
 from openarm_grasp.perception.detections import Frame
 from openarm_world.config import WorldConfig
-from openarm_world.shares import explain, fit, view_of
+from openarm_world.shares import Shares, explain, fit, view_of
 
 #: From which shares on an object is judged, and has left its place.
 _WORLD = WorldConfig()
@@ -39,14 +39,15 @@ _FEW = 30
 _LEVEL, _TURNED, _LEAST_POINTS = 0.5, 0.12, 10
 
 
-def judge_gone(before: Array, frames: Sequence[Frame]) -> CameraVerdict:
+def judge_gone(before: Array, frames: Sequence[Frame], lift: Array) -> CameraVerdict:
     """Whether an object has left its place: GRASP_MISSED, when it is still there; STALE_DATA, when nothing shows it.
 
     Args:
         before: (n, 3) points of it as it was before the grasp.
-        frames: Taken after the lift; each that shows its place counts.
+        frames: Taken after the lift; each that shows its place counts, and where the hand has it, that.
+        lift: (3,) how far the hand has come since it took hold, m.
     """
-    left = _left(before, frames)
+    left = _left(before, frames, se3.make(p=lift))
     if not left:
         what = "no camera frame after the lift" if not frames else "the robot or the border hides where the object was"
         return CameraVerdict(Code.STALE_DATA, f"{what}: nothing shows whether it has gone")
@@ -61,11 +62,22 @@ def stays(before: Array, frames: Sequence[Frame]) -> bool:
     return not any(left >= _WORLD.gone for left in _left(before, frames))
 
 
-def _left(before: Array, frames: Sequence[Frame]) -> list[float]:
-    """Share of the points (n, 3) in view that is seen through, of each frame that shows enough of them."""
-    clouds = (frame.cloud for frame in frames if frame.cloud is not None)
-    shares = (explain(before, np.eye(4), view_of(cloud.points, cloud.camera)) for cloud in clouds)
-    return [one.left for one in shares if one.in_view >= _WORLD.in_view]
+def _left(before: Array, frames: Sequence[Frame], T_carried: Array | None = None) -> list[float]:
+    """Share of the points (n, 3) in view that is seen through, of each frame that shows enough of them.
+
+    What is seen where a hand has carried it (4, 4) has left its place, whatever is seen there: some detectors take what
+    hangs in the air for something that stands on the table.
+    """
+    views = (view_of(frame.cloud.points, frame.cloud.camera) for frame in frames if frame.cloud is not None)
+    found: list[float] = []
+    for view in views:
+        carried = Shares(0.0, 0.0, 1.0) if T_carried is None else explain(before, T_carried, view)
+        there = explain(before, np.eye(4), view)
+        if carried.seen >= _WORLD.same and carried.left <= _MOVED:
+            found.append(1.0)
+        elif there.in_view >= _WORLD.in_view:
+            found.append(there.left)
+    return found
 
 
 def judge_held(standing: Array, points: Array, T_now_before: Array, config: HeldConfig) -> CameraVerdict:

@@ -299,7 +299,9 @@ class GraphClients:
             mounted = load_cameras().get(camera)
             if mounted is None or self.sees(_points_of(self._topic)):
                 return frame
-            T, lens = buffer.lookup(base, mounted.optical_frame, frame.t_ns), mounted.intrinsics
+            lens = mounted.intrinsics
+            # from a mount that is a little off they are seen alike
+            T = buffer.lookup(base, mounted.parent, frame.t_ns) @ mounted.T_parent_optical
             shapes = self._outline.shapes(buffer.latest()[1], self.robot.tracker.held)
             return with_points(frame, lens, T, self.table_z, self._outline.outline(lens, T, shapes))
         except OpenArmError as error:

@@ -334,7 +334,7 @@ def _judge_lifted(run: Run, grasp: Grasp, frames: Sequence[Frame]) -> tuple[Gras
     thing = lifted(frames, sighting, points, T_now_before, T_before[:3, 3])
     if thing is not sighting:
         grasp = run.grasp = regrasped(run, grasp, thing)
-    gone = judge_gone(first_points(thing), frames)
+    gone = judge_gone(first_points(thing), frames, (T - T_before)[:3, 3])
     if not gone.ok:
         return grasp, gone  # also where no points of it are known
     before = np.concatenate([object_points(sighting.clouds), points_around(sighting.clouds)])

@@ -31,6 +31,7 @@ TABLE = np.array([(x, y, z) for x in (0.0, 0.5) for y in (-0.35, 0.1) for z in (
 TOP = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 CUBE, BRICK, TALL = (0.05, 0.05, 0.05), (0.06, 0.07, 0.04), (0.04, 0.06, 0.09)
 HERE, THERE = (0.27, -0.2), (0.2, -0.05)
+LIFT = np.array([0.0, 0.0, 0.12])
 
 
 def box(at=HERE, size=CUBE, yaw=0.0, up=0.0, label="red") -> Detection:
@@ -110,7 +111,7 @@ def test_what_the_robot_hides_has_not_moved_and_has_not_gone() -> None:
     hidden = with_points(Frame(1, ()), LENS, T_CAMERA, TABLE_Z, robot)
     assert not len(hidden.cloud.points)
     assert judge_unmoved(points(upright(box())), [hidden])[0]
-    assert judge_gone(points(upright(box())), [hidden]).code is Code.STALE_DATA
+    assert judge_gone(points(upright(box())), [hidden], LIFT).code is Code.STALE_DATA
 
 
 @pytest.mark.requirement("N-03")
@@ -133,6 +134,10 @@ def test_of_what_is_seen_in_part_nothing_is_known() -> None:
         ([(box(label="blue"),)], Code.GRASP_MISSED, "still seen at its place"),
         ([(box(at=(0.28, -0.2)),)], Code.GRASP_MISSED, "still seen at its place"),
         ([(box(up=0.02),)], Code.GRASP_MISSED, "hides where the object was"),
+        ([(box(up=0.12),)], Code.OK, "has gone"),
+        ([(box(size=(0.05, 0.05, 0.17)),)], Code.OK, "has gone"),  # it hangs in the hand, and is taken for a tall box
+        ([(box(size=(0.05, 0.05, 0.15)),)], Code.GRASP_MISSED, "still seen at its place"),  # it would have slipped
+        ([(box(at=(0.29, -0.2), size=(0.05, 0.05, 0.17)),)], Code.GRASP_MISSED, ""),  # it would be held by an edge
         ([(), (box(),)], Code.GRASP_MISSED, "still seen at its place"),
         ([(box(),), ()], Code.GRASP_MISSED, "still seen at its place"),
         ([(box(at=(0.27, -0.14)),)], Code.OK, "has gone"),  # its twin, next to it
@@ -141,7 +146,7 @@ def test_of_what_is_seen_in_part_nothing_is_known() -> None:
 )
 @pytest.mark.requirement("P-08")
 def test_an_object_has_left_its_place_when_it_is_seen_through(image, after, code, reason) -> None:
-    verdict = judge_gone(points(image(box())), [image(*one) for one in after])
+    verdict = judge_gone(points(image(box())), [image(*one) for one in after], LIFT)
     if code is Code.GRASP_MISSED and reason == "hides where the object was":
         assert not verdict.ok  # a hand that holds it so low hides its place, or it is seen there
         return
@@ -170,7 +175,7 @@ def test_what_hangs_elsewhere_in_the_hand_than_it_should_is_seen_beside_or_below
     kept = ~(held.all(axis=1) & (frame.cloud.labels == 1))
     frame = replace(frame, cloud=replace(frame.cloud, points=frame.cloud.points[kept], labels=frame.cloud.labels[kept]))
     sighting = Sighting(before, (), 0, (first.cloud,))
-    assert judge_gone(points(first), [frame]).ok
+    assert judge_gone(points(first), [frame], LIFT).ok
     risen = risen_points([frame], sighting, HELD.rise)
     verdict = judge_held(columns(points(first), TABLE_Z), risen, lifted, HELD)
     assert verdict.code is code, verdict.reason

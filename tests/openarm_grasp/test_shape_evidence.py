@@ -23,6 +23,7 @@ from openarm_grasp.planning.neighbours import columns
 from openarm_grasp.requests.task import Grasp
 
 HELD = HeldConfig()
+LIFT = np.array([0.0, 0.0, 0.12])
 
 
 def grip(gap, **kwargs):
@@ -331,6 +332,6 @@ def test_what_has_moved_is_seen_through_where_it_stood(frames, still, words):
     ],
 )
 def test_an_object_has_gone_when_a_free_view_shows_its_place_empty(frames, code, words):
-    verdict = judge_gone(HANDLE, frames)
+    verdict = judge_gone(HANDLE, frames, LIFT)
     assert (verdict.code, words in verdict.reason) == (code, True), verdict.reason
-    assert stays(HANDLE, frames) is (not any(judge_gone(HANDLE, [one]).ok for one in frames))
+    assert stays(HANDLE, frames) is (not any(judge_gone(HANDLE, [one], LIFT).ok for one in frames))
