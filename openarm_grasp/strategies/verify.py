@@ -68,17 +68,19 @@ async def verify(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]
 def _judge(run: Run, grasp: Grasp, target: PlaceTarget, frames: Sequence[Frame]) -> CameraVerdict:
     """Judge by the points of what was put down.
 
-    Of what is no prism one image that shows it at its place is enough: of a thin thing another may show a part. Of what
-    had turned in the hand nothing is said: a part that is out of view may make up for a shift.
+    Of a prism the newest image counts; of anything else one that shows it at its place is enough: of a thin thing
+    another may show a part. Of what had turned in the hand nothing is said: a part that is out of view may make up for
+    a shift.
     """
     if grasp.turned:
         return _unproven("it had turned or slipped in the hand: nothing shows that it is where it should be")
-    verdicts = list[CameraVerdict]()
-    for frame in reversed(frames):
-        verdicts.append(_seen(frame, run, grasp, target))
-        if verdicts[-1].ok or grasp.sighting.target.kind:
-            return _gone_with_it(grasp, frames) or verdicts[-1] if verdicts[-1].ok else verdicts[-1]
-    return verdicts[0] if verdicts else CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
+    newest = CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
+    for age, frame in enumerate(reversed(frames[-1:] if grasp.sighting.target.kind else frames)):
+        verdict = _seen(frame, run, grasp, target)
+        if verdict.ok:
+            return _gone_with_it(grasp, frames) or verdict
+        newest = verdict if age == 0 else newest
+    return newest
 
 
 def _unproven(text: str, *, final: bool = False) -> CameraVerdict:
@@ -118,6 +120,8 @@ def _seen(frame: Frame, run: Run, grasp: Grasp, target: PlaceTarget) -> CameraVe
         same = _same(run, grasp, T, T @ se3.inverse(T_motion), seen)
         if not same.ok:
             return same
+    if before.kind and (now is None or now.label != before.label):
+        return _unproven(f"what is seen there is {'nothing' if now is None else repr(now.label)}, not {before.label!r}")
     if before.kind:  # its middle is known, whatever is seen of it
         middles = se3.apply(T, before.p_base)[None, :2]
     elif now is None or not now.measured:

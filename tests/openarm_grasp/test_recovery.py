@@ -174,6 +174,14 @@ def test_a_yaw_that_was_asked_for_is_seen_unless_what_stands_there_looks_square(
     assert world.grasp(place=(0.2, -0.3, 0.4)).success  # any yaw will do
 
 
+@pytest.mark.requirement("P-09")
+def test_something_else_at_the_place_is_not_what_was_put_down(world):
+    world.lands = lambda stands: replace(stands, name="green") if world.state is State.PLACE else stands
+    outcome = world.grasp()
+    assert outcome.code is Code.PLACE_FAILED
+    assert "what is seen there is 'green', not 'red'" in outcome.message
+
+
 @pytest.mark.requirement("N-03", "P-09")
 @pytest.mark.parametrize("missed", [0, 1, 2])
 def test_a_placed_object_that_the_detector_misses_in_one_frame_is_placed(world, missed):

@@ -36,7 +36,7 @@ def test_a_program_picks_and_places_in_two_requests(bench):
 
     unknown, picked, other, placed = bench.program(work)
     assert unknown.code is Code.UNKNOWN_OBJECT
-    with pytest.raises(OpenArmError, match="no 'mug' in view; in view: blue, red"):
+    with pytest.raises(OpenArmError, match=r"no 'mug' in view; in view: blue \(box\), red \(box\)"):
         unknown.raise_for_code()
     assert (picked.outcome, picked.code) == ("SUCCESS", Code.OK), picked.message
     assert picked.raise_for_code() is picked
