@@ -32,6 +32,8 @@ _NEXT_CELL = 1.8
 _LEFT = 0.15
 #: What came next to an object has more than this share of its points: fewer are flying pixels.
 _CAME = 0.1
+#: So many points of what hangs in a hand may be of the edge of the hand, %.
+_OF_HAND = 15.0
 #: Fewer points are no cluster.
 _LEAST_POINTS = 30
 
@@ -71,7 +73,7 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
                 continue
             # of what hangs in a hand an end may be all that is seen; a few points that fly make it no neighbour
             beside = float(np.percentile(place.query(points[:, :2])[0], 2.0))
-            risen = float(np.percentile(points[:, 2], 2.0)) - target.bottom if target.kind else _top(points) - top
+            risen = float(np.percentile(points[:, 2], _OF_HAND)) - target.bottom if target.kind else _top(points) - top
             if risen >= rise and beside <= _OVER:
                 found.append(points)
     clouds, points = sighting.clouds[-1:], np.concatenate(found)
