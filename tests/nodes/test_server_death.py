@@ -72,6 +72,7 @@ from unique_identifier_msgs.msg import UUID
 from openarm_common.config import Config
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.node import BaseNode
+from openarm_motion.config import ExecutionConfig
 from openarm_motion.ros.robot import Controller
 from openarm_motion.timing.trajectory import Trajectory
 
@@ -80,7 +81,8 @@ node = BaseNode("owner", Config)
 executor = rclpy.executors.SingleThreadedExecutor()
 executor.add_node(node)
 goal_id = lambda: UUID(uuid=list(os.urandom(16)))
-controller = Controller(node, "/right_joint_trajectory_controller/follow_joint_trajectory", goal_id)
+name = "/right_joint_trajectory_controller/follow_joint_trajectory"
+controller = Controller(node, name, ExecutionConfig(), goal_id)
 here, there = (np.array([float(x) for x in part.split(",")]) for part in sys.argv[1:])
 names = tuple(f"openarm_right_joint{i}" for i in range(1, 8))
 t = np.array([0.0, 0.3, 5.7, 6.0])
@@ -89,7 +91,7 @@ q = np.array([here, here + 0.15 * speed, there - 0.15 * speed, there])
 v = np.array([0.0 * speed, speed, speed, 0.0 * speed])
 while not controller.ready():
     executor.spin_once(timeout_sec=0.1)
-goal = controller.start(Trajectory(names, t, q, v, 0.0 * v), 0)
+goal = controller.start(Trajectory(names, t, q, v, 0.0 * v), 0, touches=True)
 executor.spin()
 """
 

@@ -160,8 +160,9 @@ class FakeGraph(Node):
         before = p + np.array([target.approach_offset.x, target.approach_offset.y, target.approach_offset.z])
         start = np.array(request.start or [self.q[n] for n in self.robot.arm_joints(request.arm)])
         q = self._reach(request.arm, before)
-        result.transfer = self._trajectory(request.arm, start, q)
         down = self._reach(request.arm, p, q)
+        q = down if request.blend_approach else q
+        result.transfer = self._trajectory(request.arm, start, q)
         result.approach = self._trajectory(request.arm, q, down)
         result.retreat = self._trajectory(request.arm, down, self._reach(request.arm, end, down))
         result.scene_version = self.scene

@@ -51,8 +51,7 @@ def test_a_grasp_by_service_places_the_object_publishes_its_states_and_moves_han
         "execute",  # to the grasp
         "gripper 0",
         "execute",  # lift
-        "execute",  # carry
-        "execute",  # down
+        "execute",  # carry and down
         "gripper 0.044",
         "execute",  # leave
         "move home",

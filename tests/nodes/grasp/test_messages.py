@@ -29,3 +29,4 @@ def test_a_plan_of_what_comes_later_names_where_the_object_will_not_stand_any_mo
         np.testing.assert_allclose(pose_to_matrix(region.pose), gone.T_frame_box)
         assert (region.size.x, region.size.y, region.size.z) == gone.size
     assert list(messages.plan_goal(PlanGrasp("right", ways, (), (box,)), 0.0).ignore_regions) == []
+    assert (grasp.blend_approach, place.blend_approach) == (False, True)

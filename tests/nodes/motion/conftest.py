@@ -66,6 +66,8 @@ class FakeRobot:
         self.active: dict[str, tuple[int, list[str], np.ndarray, np.ndarray]] = {}
         self._wake = Future()
         self.goal_ids: list[bytes] = []
+        #: Goal tolerances of what was sent, rad; of one kind, or the controller's own.
+        self.tolerances: list[set[float]] = []
         self._publisher = node.create_publisher(JointState, "/joint_states", QOS_COMMAND)
         tf = node.create_publisher(TFMessage, "/tf_static", QOS_STATIC_TF)
         table = matrix_to_transform("world", "table", se3.make(None, (0.0, 0.0, 0.40)), 0)
@@ -106,6 +108,7 @@ class FakeRobot:
 
     async def _execute(self, side: str, handle) -> FollowJointTrajectory.Result:
         self.goal_ids.append(bytes(handle.goal_id.uuid))
+        self.tolerances.append({joint.position for joint in handle.request.goal_tolerance})
         names, t, q, _, _ = trajectory_from_msg(handle.request.trajectory)
         begin_ns = stamp_to_ns(handle.request.trajectory.header.stamp) or self.t_ns
         self.active[side] = (begin_ns, names, t, q)

@@ -40,7 +40,7 @@ def test_a_bad_trajectory_is_refused_with_joint_and_value(bench) -> None:
 
 def test_a_motion_that_is_withdrawn_before_its_controller_answers_is_cancelled_with_the_answer(bench) -> None:
     motion = Trajectory(*trajectory_from_msg(bench.slow_plan()))
-    goal = bench.node.robot.controller("right").start(motion, 0)
+    goal = bench.node.robot.controller("right").start(motion, 0, touches=True)
     goal.cancel()
     bench.ros.spin_until(lambda: goal.outcome is not None, what="its end")
     assert bench.robot.cancelled == ["right"]

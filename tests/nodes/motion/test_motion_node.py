@@ -92,17 +92,23 @@ def approach_goal(bench, **kwargs) -> PlanApproach.Goal:
     )
 
 
-def test_a_grasp_is_planned_executed_and_shown_as_attached_b47(bench) -> None:
-    plan = bench.run(bench.plan_client, approach_goal(bench, attached_after_approach=True))
+@pytest.mark.parametrize("blend", [False, True])
+def test_a_grasp_is_planned_executed_and_shown_as_attached_b47(bench, blend: bool) -> None:
+    plan = bench.run(bench.plan_client, approach_goal(bench, attached_after_approach=True, blend_approach=blend))
     assert (plan.success, plan.code, plan.chosen) == (True, "OK", 1), plan.message
     assert [(r.id, r.code) for r in plan.refusals] == [("far", "UNREACHABLE")]
     far, near = plan.limit_margins
     assert np.isnan(far)
     assert 0.05 <= near < 1.6  # the limit margin of the planner, and less than half of the narrowest joint's range
     assert plan.planning_time > 0.0
+    last, first = plan.transfer.points[-1].positions, plan.approach.points[0].positions
+    np.testing.assert_allclose(first, last, atol=1e-6)
+    assert (list(plan.approach.points[-1].positions) == list(first)) is blend
     for part, held in ((plan.transfer, []), (plan.approach, []), (plan.retreat, ["right/cube"])):
         bench.done(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=part))
         bench.ros.spin_until(lambda held=held: bench.held() == held, what=f"{held} shown as attached")
+    near = {bench.node.config.execution.goal_tolerance}
+    assert bench.robot.tolerances == [set() if blend else near, set(), near], "none of its own where it touches"
     marker = bench.markers[-1].markers[-1]
     assert marker.header.frame_id == "openarm_right_hand_tcp"
     assert marker.scale.x == pytest.approx(0.05)
