@@ -326,10 +326,11 @@ class _Checks:
             found = timing.trajectory()
             if found.duration >= stopping.duration:
                 break
-            found, k = found.of(arm.names), int(np.searchsorted(found.t, timing.moments[before - 1]))
+            found, end = found.of(arm.names), len(found.t) - 1
+            k = min(int(np.searchsorted(found.t, timing.moments[before - 1])), end)
             try:
                 validate_trajectory(self.free, found.between(0, k))
-                validate_trajectory(self._approach, found.between(k, len(found.t) - 1))
+                validate_trajectory(self._approach, found.between(k, end))
             except PlanFailedError as error:
                 left = timing.round_less(error.at)
             else:

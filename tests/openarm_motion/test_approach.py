@@ -397,6 +397,20 @@ def test_the_corner_before_a_place_keeps_clear_of_what_stands_around_it(right: A
     assert max(gains) > 0.1
 
 
+@pytest.mark.parametrize("length", [0.0, 1e-7, 0.004, 0.02])
+def test_a_line_of_any_length_is_blended(right: Arm, home: dict[str, float], length: float) -> None:
+    request = place(0.28, -0.25)
+    ways = tuple(replace(way, approach_offset=np.array([0.0, 0.0, length])) for way in request.targets)
+    plan = plan_approach(right, right.start_state(home), replace(request, targets=ways, attached=()))
+    np.testing.assert_allclose(
+        right.kinematics.fk(plan.transfer.q[-1])[:3, 3], ways[plan.chosen].pose[:3, 3], atol=1e-5
+    )
+    assert max(shares_of_limits(plan.transfer, right.limits(0.0))) <= 1.0 + 1e-6
+    there = right.start_state({**home, **dict(zip(right.names, plan.transfer.q[-1].tolist(), strict=True))})
+    again = plan_approach(right, there, replace(request, targets=ways, attached=()))
+    assert again.transfer.duration < 1.0
+
+
 def test_a_corner_that_cannot_be_rounded_has_a_stop(
     right: Arm, home: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
