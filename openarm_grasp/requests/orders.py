@@ -144,14 +144,13 @@ class _InVain:
 class Order:
     """Objects to be picked in rounds: of those that fit, the easiest first.
 
-    In a round everything in view is asked for once. Each of several arms is asked by its name for the next object as
-    soon as it is free (list scheduling, Graham 1966), and for everything in view; all else is asked for of whichever
-    arm, when none is at work. What cannot be taken is left, and asked for in another round when an arm has moved
-    anything since: it may have been in the way, or have hidden it, or lie otherwise itself. After a round in which
-    nothing has moved, each thing that fits into a hand is asked for by where it is: what stands close to
-    it may be pushed aside then. Where whatever there is is wanted, what no hand takes is pushed aside itself at last,
-    since things may lie below it. The order ends when nothing is left, when nothing moves any more, or when all that
-    moves does so in vain.
+    In a round everything in view is asked for once: of each of several arms, by its name, as soon as it is free (list
+    scheduling, Graham 1966). All else is asked for when no arm is at work, of whichever. What cannot be taken is left,
+    and asked for in another round when an arm has moved anything since: it may have been in the way, or have hidden it,
+    or lie otherwise itself. After a round in which nothing has moved, each thing that fits into a hand is asked for by
+    where it is: what stands close to it may be pushed aside then. Where whatever there is is wanted, what no hand takes
+    is pushed aside itself at last, since things may lie below it. The order ends when nothing is left, when nothing
+    moves any more, or when all that moves does so in vain.
 
     Attributes:
         labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
@@ -263,13 +262,12 @@ class Order:
 
         What an arm reached, but could not take, may have come free when anything has been moved since.
         """
-        kept = (one for one in self.left if one.arm in (arm, _ANY_ARM))
-        kept = (
-            one
-            for one in kept
-            if _ANY_ARM in (one.arm, arm) or one.code is Code.UNREACHABLE or one.after >= self._moved
-        )
-        left = (one.where for one in kept if one.where is not None)
+
+        def stays(one: Left) -> bool:
+            moved = one.code is not Code.UNREACHABLE and one.after < self._moved
+            return one.arm == _ANY_ARM or (one.arm == arm and not moved)
+
+        left = (one.where for one in self.left if one.where is not None and stays(one))
         # of one bin, the last arm fills the other end
         spots = self._spots(label)[:: -1 if arm in self.arms[1:] else 1]
         return GraspRequest(f"{EASIEST} {label}", arm, exclude_near=(*self._stand, *left), place_choices=spots)

@@ -59,6 +59,7 @@ class GraphRobot:
     def next_to_other(self) -> GraphRobot:
         """The same for an arm that moves while the other does: its motions may start later, and it ends by itself."""
         robot = copy(self)
+        robot._cancelled = False
         robot.max_start_delay = self._config.limits.beside_wait
         return robot
 

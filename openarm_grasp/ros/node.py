@@ -130,7 +130,9 @@ class GraspNode(BaseNode[GraspConfig]):
 
     async def _on_learn(self, arm: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
-            response.message = await self._take("the learning of a hand", self._arms, lambda: self._learn(arm))
+            response.message = await self._take(
+                "the learning of a hand", self._arms, lambda: self._learn(arm, self._robot)
+            )
             response.success = True
         except OpenArmError as error:
             response.message = f"{error.code}: {error.message}"
@@ -173,9 +175,9 @@ class GraspNode(BaseNode[GraspConfig]):
         return ActionServer(self, kind, name, execute, cancel_callback=self._on_cancel)
 
     # --- hands
-    async def _learn(self, arm: str) -> str:
+    async def _learn(self, arm: str, robot: GraphRobot) -> str:
         """Learn a hand, use it as it is from now on, and store it; return what was learned, in a sentence."""
-        reach = await learn_hand(self._skills, arm, self.config.timing.settle_limit)
+        reach = await learn_hand(Skills(robot, self.config), arm, self.config.timing.settle_limit)
         folder = Path(self.config.calibrations).expanduser() if self.config.calibrations else default_folder()
         path = keep_hand(folder, zeros_of(), arm, reach)
         if run := zeros_path():  # of nodes of this run that start again
@@ -186,12 +188,12 @@ class GraspNode(BaseNode[GraspConfig]):
         self._session.context = replace(self._session.context, hands=self.description.hands)
         return f"the {arm} hand goes from {reach}, and presses with {reach.effort:.0f} N closed on nothing; in {path}"
 
-    async def _learn_unknown(self, arms: Sequence[str], *requests: GraspRequest) -> None:
+    async def _learn_unknown(self, robot: GraphRobot, arms: Sequence[str], *requests: GraspRequest) -> None:
         """Learn the hands of which nothing was learned, where that is allowed, before requests that may move them."""
         if self.config.hand.learn and not any(one.dry_run or one.phase == "place" for one in requests):
             for arm, hand in self.description.hands.items():
                 if arm in arms and hand.reach is None:
-                    self.get_logger().info(await self._learn(arm))
+                    self.get_logger().info(await self._learn(arm, robot))
 
     # --- requests
     @property
@@ -216,7 +218,7 @@ class GraspNode(BaseNode[GraspConfig]):
             request, robot = replace(request, arm=arm), self._robot.next_to_other()
 
         async def work() -> GraspOutcome:
-            await self._learn_unknown(arms, request)
+            await self._learn_unknown(robot, arms, request)
             skills = coordinated(arm, robot, self._coordination, self.config) if arm else self._skills
             return await carry_out(Task(self._session, skills, request, report, index))
 
@@ -240,7 +242,7 @@ class GraspNode(BaseNode[GraspConfig]):
         robots: dict[str, RobotInterface] = {**each}
 
         async def work() -> PairOutcome:
-            await self._learn_unknown(self._arms, *requests)
+            await self._learn_unknown(self._robot, self._arms, *requests)
             return await carry_out_pair(Pair(self._session, self._skills, robots, requests, report, carry_out))
 
         named = _grasp_of(*(request.cut() for request in requests))

@@ -166,7 +166,7 @@ class Run:
         """
         runs, (x, y, _) = self.task.session.runs, outcome.place_position
         runs.remove(self)
-        for other in runs if outcome.success else ():  # what was placed meanwhile it does not take
+        for other in runs if outcome.success and self.tried else ():  # what was placed meanwhile it does not take
             other.request = other.request.without((x, y))
         check_transition(self.state, State.IDLE)
         text, task = outcome.message, self.task

@@ -266,13 +266,21 @@ def test_a_request_never_takes_what_another_one_has_placed_since_it_began(world)
 
     def on_report(status) -> None:
         if status.state is State.DETECT and other in world.session.runs:
-            other.state = State.RESET
+            other.state, other.tried = State.RESET, 1
             other.end(placed)
 
     world.on_report = on_report
     world.ends(Code.UNKNOWN_OBJECT, "besides 1 that must stay where they are", "red")
     world.succeeds("red")  # a request that comes afterwards may
     assert world.session.runs == []
+
+
+def test_who_leaves_what_was_placed_leaves_what_the_other_arm_has_placed_before_they_heard_of_it(world) -> None:
+    world.session.note_placed(world.objects["blue"].p_base, np.zeros((0, 3)))
+    world.session.note_placed(world.objects["red"].p_base, np.zeros((0, 3)))
+    refused_as = "besides 2 that must stay where they are"
+    world.ends(Code.UNKNOWN_OBJECT, refused_as, "anything", exclude_near=((0.26, 0.2),))
+    assert world.succeeds("anything", exclude_near=((0.26, -0.2),)).label == "blue"  # placed before
 
 
 def test_of_the_easiest_an_arm_by_name_takes_the_outermost_on_its_side_first(worlds) -> None:

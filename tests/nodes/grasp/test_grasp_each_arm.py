@@ -8,7 +8,8 @@ import os
 
 import pytest
 from action_msgs.msg import GoalStatus
-from openarm_interfaces.action import Pick
+from openarm_interfaces.action import Pick, PickTwo
+from openarm_interfaces.msg import PickRequest
 from rclpy.task import Future
 
 from openarm_bringup import cli
@@ -77,6 +78,20 @@ def test_a_cancel_ends_its_own_request_and_the_other_arm_goes_on(bench) -> None:
     next_to = bench.ask("red", arm="right")  # which drops nothing
     assert next_to.success, next_to.message
     assert bench.world.hands == {"left": "blue"}
+
+
+def test_what_was_cancelled_ends_nothing_that_comes_later(bench) -> None:
+    waits = held_up(bench, "right")
+    handle, red = send(bench, "red")
+    bench.until(lambda: bench.begun, what="the right arm lifts")
+    assert bench.ros.result(handle.cancel_goal_async()).goals_canceling
+    assert bench.ros.result(red).result.code == "CANCELLED"
+    waits["right"].cancel()
+    bench.world.during = lambda what: None
+    assert bench.ask("", phase="place").success
+    _, both = bench.ros.send_goal(bench.two, PickTwo.Goal(requests=[PickRequest(label=n) for n in ("red", "blue")]))
+    assert bench.ros.result(both, 60.0).result.success
+    assert bench.ask("red", arm="right").success
 
 
 def test_an_order_asks_both_arms_and_what_is_placed_by_one_is_not_taken_by_the_other(bench, tmp_path) -> None:
