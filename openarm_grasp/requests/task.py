@@ -100,6 +100,23 @@ class Placed:
     failure: Verdict | None = None
 
 
+@dataclass(frozen=True)
+class _Stand:
+    """An object that was placed.
+
+    Attributes:
+        spot: (x, y), base frame, m.
+        id: Id of the object.
+        began_ns: Robot time at which the request began that has placed it.
+        ended_ns: Robot time at which it stood there.
+    """
+
+    spot: Spot
+    id: str
+    began_ns: int
+    ended_ns: int
+
+
 class GraspSession:
     """What outlives a request: the objects that hands keep, and what grasps show about the camera.
 
@@ -115,22 +132,40 @@ class GraspSession:
         self.kept: dict[str, Grasp] = {}
         #: Requests that are being carried out.
         self.runs: list[Run] = []
-        #: (x, y) of the newest objects that were placed, and their ids.
-        self._placed: list[tuple[Array, str]] = []
+        #: The newest objects that were placed.
+        self._placed: list[_Stand] = []
 
-    def note_placed(self, position: Array, name: str) -> None:
-        """Remember where an object was placed, in place of what was placed there before.
+    def note_placed(self, run: Run, position: Array, name: str) -> None:
+        """Remember which object a request has placed where, in place of what was placed there before.
 
         Args:
+            run: The request.
             position: (2,) or (3,) base frame, m.
-            name: Its id.
+            name: Id of the object.
         """
-        kept = [one for one in self._placed if np.linalg.norm(one[0] - position[:2]) >= SAME_SPOT]
-        self._placed = [*kept[1 - _REMEMBERED :], (position[:2], name)]
+        spot = (float(position[0]), float(position[1]))
+        kept = [one for one in self._placed if math.dist(one.spot, spot) >= SAME_SPOT]
+        self._placed = [*kept[1 - _REMEMBERED :], _Stand(spot, name, run.began_ns, run.robot.now_ns)]
 
-    def placed_at(self, spots: Sequence[Spot]) -> Mapping[Spot, str]:
-        """Return the ids of what was placed at positions, of those where that is known."""
-        return {spot: name for spot in spots for p, name in self._placed if math.dist(p, spot) < SAME_SPOT}
+    def stay(self, spots: Sequence[Spot]) -> Mapping[Spot, str]:
+        """Return positions of what must stay, with the ids of what was placed there, "" where that is not known.
+
+        Who names what a request has placed may not have heard yet of what was placed since that began: it stays, too.
+        """
+        named = [one.began_ns for one in self._placed if any(math.dist(one.spot, spot) < SAME_SPOT for spot in spots)]
+        since = (one.spot for one in self._placed if named and one.ended_ns >= named[-1])
+        found = dict.fromkeys((*spots, *since), "")
+        return found | {
+            spot: one.id for one in self._placed for spot in found if math.dist(one.spot, spot) < SAME_SPOT
+        }
+
+    def end(self, run: Run, outcome: GraspOutcome) -> None:
+        """End a request; what it has placed no other takes that runs."""
+        self.runs.remove(run)
+        if outcome.success and run.tried:
+            x, y, _ = outcome.place_position
+            for other in self.runs:
+                other.request = other.request.without((x, y))
 
     def beside(self, run: Run, request: GraspRequest) -> GraspRequest:
         """Return a request for what no other request is at: neither where it takes it nor where it puts it."""

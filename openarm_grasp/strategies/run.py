@@ -34,7 +34,8 @@ class Run:
 
     def __init__(self, task: Task, request: GraspRequest, kept: Grasp | None) -> None:
         self.task, self.kept = task, kept
-        self.request = replace(request, placed=task.session.placed_at(request.exclude_near))
+        stay = task.session.stay(request.exclude_near)
+        self.request = replace(request, exclude_near=tuple(stay), placed=stay)
         self.robot, self.context, self.config = task.robot, task.context, task.context.config
         self.began_ns = task.robot.now_ns
         self.state = State.IDLE
@@ -164,10 +165,7 @@ class Run:
         Raises:
             OpenArmError: INTERNAL, when it may not end in this state.
         """
-        runs, (x, y, _) = self.task.session.runs, outcome.place_position
-        runs.remove(self)
-        for other in runs if outcome.success and self.tried else ():  # what was placed meanwhile it does not take
-            other.request = other.request.without((x, y))
+        self.task.session.end(self, outcome)
         check_transition(self.state, State.IDLE)
         text, task = outcome.message, self.task
         about = Status(State.IDLE, self.state, text, label=outcome.label, arm=outcome.arm, request=task.index)

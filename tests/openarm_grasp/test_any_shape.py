@@ -69,8 +69,8 @@ def test_what_the_border_cuts_is_placed_when_all_of_it_is_seen_there(recorded: R
 def test_what_was_placed_is_known_by_its_id_and_not_picked_again(recorded: Recordings) -> None:
     robot = recorded(alone("banana", 0.27, -0.22, 0.4))
     x, y, _ = robot.succeeds("anything").place_position
-    assert robot.session.placed_at(((x, y),))[x, y]
-    assert robot.session.placed_at(((x + 0.05, y),)) == {}
+    assert robot.session.stay(((x, y),))[x, y]
+    assert not robot.session.stay(((x + 0.05, y),))[x + 0.05, y]
     again = robot.ask("anything", exclude_near=((x, y),))
     assert again.code is Code.UNKNOWN_OBJECT
     assert "besides 1 that must stay" in again.message

@@ -238,6 +238,13 @@ def next_to(world, label: str, arm: str = "right") -> Run:
     return Run(world.task(request), request, None)
 
 
+def end(run: Run, x: float, y: float) -> None:
+    """End a request that has placed something."""
+    run.state, run.tried = State.RESET, 1
+    proof = Proof(Verdict(Code.OK, "held"), Verdict(Code.OK, "at its place"))
+    run.end(GraspOutcome(Code.OK, "placed", "a", attempts=1, place_position=(x, y, 0.4), proof=proof))
+
+
 def test_a_request_never_takes_what_another_one_is_at_or_puts_down(world) -> None:
     other = next_to(world, "red")
     other.seen_at = world.objects["red"].p_base
@@ -260,14 +267,11 @@ def test_what_another_hand_is_about_to_lift_is_no_obstacle(world) -> None:
 
 
 def test_a_request_never_takes_what_another_one_has_placed_since_it_began(world) -> None:
-    other, (x, y, z) = next_to(world, "red"), world.objects["red"].p_base
-    proof = Proof(Verdict(Code.OK, "held"), Verdict(Code.OK, "at its place"))
-    placed = GraspOutcome(Code.OK, "placed", "red", attempts=1, place_position=(x, y, z), proof=proof)
+    other, (x, y, _) = next_to(world, "red"), world.objects["red"].p_base
 
     def on_report(status) -> None:
         if status.state is State.DETECT and other in world.session.runs:
-            other.state, other.tried = State.RESET, 1
-            other.end(placed)
+            end(other, x, y)
 
     world.on_report = on_report
     world.ends(Code.UNKNOWN_OBJECT, "besides 1 that must stay where they are", "red")
@@ -275,12 +279,20 @@ def test_a_request_never_takes_what_another_one_has_placed_since_it_began(world)
     assert world.session.runs == []
 
 
-def test_who_leaves_what_was_placed_leaves_what_the_other_arm_has_placed_before_they_heard_of_it(world) -> None:
-    world.session.note_placed(world.objects["blue"].p_base, np.zeros((0, 3)))
-    world.session.note_placed(world.objects["red"].p_base, np.zeros((0, 3)))
-    refused_as = "besides 2 that must stay where they are"
-    world.ends(Code.UNKNOWN_OBJECT, refused_as, "anything", exclude_near=((0.26, 0.2),))
-    assert world.succeeds("anything", exclude_near=((0.26, -0.2),)).label == "blue"  # placed before
+@pytest.mark.parametrize("first", ["red", "blue"])
+def test_who_leaves_what_one_arm_placed_leaves_what_the_other_placed_meanwhile_unheard_of(world, first) -> None:
+    spots = {label: tuple(one.p_base[:2]) for label, one in world.objects.items()}
+    runs = {label: next_to(world, label, arm) for label, arm in (("red", "right"), ("blue", "left"))}
+    for label in sorted(runs, key=lambda name: name != first):
+        world.pass_time(1.0)
+        end(runs[label], *spots[label])
+    for label in runs:
+        world.ends(Code.UNKNOWN_OBJECT, "besides 2 that must stay", "anything", exclude_near=(spots[label],))
+    world.pass_time(1.0)
+    later = next_to(world, "green")
+    world.pass_time(1.0)
+    end(later, 0.5, 0.0)
+    assert world.succeeds("anything", exclude_near=((0.5, 0.0),)).success
 
 
 def test_of_the_easiest_an_arm_by_name_takes_the_outermost_on_its_side_first(worlds) -> None:
