@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import json
 import threading
+from concurrent import futures
 from pathlib import Path
 from typing import Any
 
@@ -164,3 +165,45 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     assert first == {"left": ((0.2, 0.26), (0.2, 0.38)), "right": ((0.2, 0.38), (0.2, 0.26))}
     assert {one["arm"] for one in asked if {(0.2, 0.3), (0.2, 0.1)} <= {*one["exclude_near"]}} == {"left", "right"}
     assert (asked[-1]["object_at"], asked[-1]["phase"], asked[-1]["arm"]) == ((0.2, 0.1), "aside", "auto")
+
+
+@pytest.mark.requirement("P-21")
+def test_ctrl_c_cancels_all_that_an_order_has_asked_for_and_waits_for_its_end(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop, ended = threading.Event(), list[str]()
+
+    def answer(label: str, *, arm: str, **_: Any) -> GraspResult:
+        assert stop.wait(10.0)
+        ended.append(arm)
+        return GraspResult(False, Code.CANCELLED, "cancelled", "CANCELLED", "", arm, 0, (0.0, 0.0, 0.0), 1.0)
+
+    waits = [KeyboardInterrupt()]
+
+    def wait(*args: Any, **kwargs: Any) -> Any:
+        if waits:
+            raise waits.pop()
+        return futures.wait(*args, **kwargs)
+
+    monkeypatch.setattr(client, "pick", answer)
+    monkeypatch.setattr(client, "cancel", stop.set, raising=False)
+    monkeypatch.setattr(pick, "wait", wait)
+    outcome = pick.order("anything")
+    assert (outcome.success, outcome.code) == (False, Code.CANCELLED)
+    assert sorted(ended) == ["left", "right"]
+
+
+def test_an_order_whose_grasp_node_is_gone_ends_with_the_reason(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = threading.Event()
+
+    def answer(label: str, *, arm: str, **_: Any) -> GraspResult:
+        assert arm == "left" or stop.wait(10.0)
+        raise OpenArmError(Code.NOT_READY, f"the server of the {arm} arm is gone")
+
+    monkeypatch.setattr(client, "pick", answer)
+    monkeypatch.setattr(client, "cancel", stop.set, raising=False)
+    with pytest.raises(OpenArmError, match="left arm is gone"):
+        pick.order("anything")
+    assert stop.is_set()

@@ -18,6 +18,8 @@ from openarm_grasp.config import GraspConfig
 from openarm_motion.service.requests import ExecuteRequest, MotionAnswer
 from openarm_motion.timing.trajectory import Motion
 
+ARMS = ("left", "right")
+
 
 def judged(set_name: str, seed: int):
     trials = Trials(make_task(set_name, seed), SimulatedSenses(depth_noise=False), GraspConfig())
@@ -56,6 +58,21 @@ def test_two_objects_are_grasped_at_once_and_the_arms_keep_apart() -> None:
         for state in ("CLOSE_GRIPPER", "PLACE")
     )
     assert max(closed) < min(placed)  # both hands closed before either had placed; one may have to close again
+
+
+@pytest.mark.long
+@pytest.mark.requirement("A-65", "R-17")
+def test_an_arm_of_an_order_takes_the_next_object_while_the_other_is_at_work() -> None:
+    _, row = judged("orders", 613)
+    assert row["as_expected"], row["message"]
+    assert (len(row["grasps"]), all(g["placed"] for g in row["grasps"])) == (6, True)
+    assert row["arm_clearance_mm"] >= 1e3 * LEAST_CLEARANCE
+    spans = {arm: [(g["began_s"], g["began_s"] + g["sim_s"]) for g in row["grasps"] if g["arm"] == arm] for arm in ARMS}
+    for mine, theirs in (ARMS, ARMS[::-1]):
+        begun = [
+            begin for begin, _ in spans[mine] if any(low + 1.0 < begin < high - 1.0 for low, high in spans[theirs])
+        ]
+        assert begun, spans
 
 
 def test_the_judge_of_the_gap_measures_what_mujoco_measures_pair_by_pair() -> None:
