@@ -38,14 +38,14 @@ class ArmCoordination:
         at_work: What each arm is at work on, by arm; others rest.
         waiting: Arms that wait until the other goes on.
         observing: The arm that observes; "" when none does.
-        seen: Newest frames of the camera over the table.
+        seen: Newest frames of the camera over the table, by the arm that observed.
         sent_home: The arm at rest that the other sends home; "" when none is.
     """
 
     at_work: dict[str, str] = field(default_factory=dict[str, str])
     waiting: set[str] = field(default_factory=set[str])
     observing: str = ""
-    seen: Frames = field(default_factory=lambda: Frames((), ""))
+    seen: dict[str, Frames] = field(default_factory=dict[str, Frames])
     sent_home: str = ""
 
     @contextmanager
@@ -99,21 +99,21 @@ class CoordinatedRobot:
 
     # --- observing
     async def observe(self, count: int, *, near: str = "") -> Frames:
-        """Frames that are taken from now on, also for the other arm; for a request that begins, recent ones.
+        """Frames that are taken from now on; for a request that begins, those with which the arm's last one ended.
 
         What the other arm hides may not be needed. An arm that observes from home again without a motion in between
         waits until the other one hides nothing any more.
         """
         coordination, limit, robot = self._coordination, self._config.limits.beside_timeout, self._robot
         begins, self._begun = not self._begun, True
-        since_ns = robot.now_ns - (round(self._config.detect.max_age * 1e9) if begins else 0)
         again, self._observed = self._observed, self._observed or not near
+        known = coordination.seen.get(self.arm, Frames((), "")).frames[-count:]
+        recent = len(known) == count and robot.now_ns - known[-1].t_ns <= self._config.detect.max_age * 1e9
+        if begins and not near and recent:
+            return replace(coordination.seen[self.arm], frames=known)
         if again and not near and self._is_home(self.arm):
             await robot.until(self._other_is_away, limit, f"observing: the {self._other} arm is in the view")
         await robot.until(lambda: coordination.observing in ("", self.arm), limit, "observing: the other arm observes")
-        known = replace(coordination.seen, frames=coordination.seen.frames[-count:])
-        if not near and len(known.frames) == count and known.frames[-1 if begins else 0].t_ns >= since_ns:
-            return known
         coordination.observing = self.arm
         try:
             seen = await robot.observe(count, near=near)
@@ -121,7 +121,7 @@ class CoordinatedRobot:
             coordination.observing = ""
             robot.stop_observing()
         if not near:
-            coordination.seen = seen
+            coordination.seen[self.arm] = seen
         return seen
 
     def expect_near(self, camera: str) -> None:

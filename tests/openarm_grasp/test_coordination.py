@@ -154,27 +154,19 @@ def test_an_arm_looks_at_once_and_from_home_again_when_the_other_hides_nothing()
     assert (robot.steps, robot.looks) == (4, 4)
 
 
-def test_a_request_begins_with_recent_frames_and_what_was_seen_before_a_look_never_counts_for_it() -> None:
+def test_a_request_begins_with_frames_that_the_arm_has_just_seen_and_never_with_others() -> None:
     robot, coordination = Robot(), ArmCoordination({"left": "a grasp", "right": "a grasp"})
-    left, right = link(robot, "left", coordination), link(robot, "right", coordination)
-    seen = run(left.observe(3))
+    seen = run(link(robot, "left", coordination).observe(3))
     robot.now_ns += 10**8
-    assert run(right.observe(3)) == seen
-    assert run(right.observe(2)) != seen
+    following = link(robot, "left", coordination)
+    assert run(following.observe(3)) == seen
+    assert run(following.observe(3)) != seen
+    run(link(robot, "right", coordination).observe(3))
+    assert robot.looks == 3
     robot.now_ns += 10**9
-    run(link(robot, "left", coordination).observe(2))
-    run(left.observe(1, near="wrist"))
-    assert robot.looks == 4
-    coordination.observing = "left"
-
-    def ends(step: int) -> None:
-        robot.now_ns += 10**8
-        coordination.observing = ""
-        coordination.seen = Frames((Frame(robot.now_ns, ()),), "base")  # taken while the right arm waited for them
-
-    robot.on_step = ends
-    assert run(right.observe(1)) == coordination.seen
-    assert robot.looks == 4
+    run(link(robot, "left", coordination).observe(3))
+    run(link(robot, "left", coordination).observe(1, near="wrist"))
+    assert robot.looks == 5
 
 
 def test_an_arm_that_is_not_at_work_hides_nothing_that_it_would_be_waited_for() -> None:
