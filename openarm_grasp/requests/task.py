@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
@@ -155,9 +153,7 @@ class GraspSession:
         named = [one.began_ns for one in self._placed if any(math.dist(one.spot, spot) < SAME_SPOT for spot in spots)]
         since = (one.spot for one in self._placed if named and one.ended_ns >= named[-1])
         found = dict.fromkeys((*spots, *since), "")
-        return found | {
-            spot: one.id for one in self._placed for spot in found if math.dist(one.spot, spot) < SAME_SPOT
-        }
+        return found | {spot: one.id for one in self._placed for spot in found if math.dist(one.spot, spot) < SAME_SPOT}
 
     def end(self, run: Run, outcome: GraspOutcome) -> None:
         """End a request; what it has placed no other takes that runs."""
