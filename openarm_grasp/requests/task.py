@@ -133,18 +133,6 @@ class GraspSession:
         #: The newest objects that were placed.
         self._placed: list[_Stand] = []
 
-    def note_placed(self, run: Run, position: Array, name: str) -> None:
-        """Remember which object a request has placed where, in place of what was placed there before.
-
-        Args:
-            run: The request.
-            position: (2,) or (3,) base frame, m.
-            name: Id of the object.
-        """
-        spot = (float(position[0]), float(position[1]))
-        kept = [one for one in self._placed if math.dist(one.spot, spot) >= SAME_SPOT]
-        self._placed = [*kept[1 - _REMEMBERED :], _Stand(spot, name, run.began_ns, run.robot.now_ns)]
-
     def stay(self, spots: Sequence[Spot]) -> Mapping[Spot, str]:
         """Return positions of what must stay, with the ids of what was placed there, "" where that is not known.
 
@@ -156,10 +144,13 @@ class GraspSession:
         return found | {spot: one.id for one in self._placed for spot in found if math.dist(one.spot, spot) < SAME_SPOT}
 
     def end(self, run: Run, outcome: GraspOutcome) -> None:
-        """End a request; what it has placed no other takes that runs."""
+        """End a request; what it has placed is remembered, and no other takes it that runs."""
         self.runs.remove(run)
-        if outcome.success and run.tried:
+        if outcome.success and run.tried and not outcome.held:
             x, y, _ = outcome.place_position
+            name = run.grasp.sighting.target.id if run.grasp else ""
+            kept = [one for one in self._placed if math.dist(one.spot, (x, y)) >= SAME_SPOT]
+            self._placed = [*kept[1 - _REMEMBERED :], _Stand((x, y), name, run.began_ns, run.robot.now_ns)]
             for other in self.runs:
                 other.request = other.request.without((x, y))
 

@@ -123,8 +123,6 @@ async def _attempts(run: Run) -> GraspOutcome:
         if placed is not None and placed.failure is None:
             seen = await verify(run, grasp, placed, frames)
             if seen.ok:
-                position = (run.place_target or placed.target).position
-                run.task.session.note_placed(run, position, grasp.sighting.target.id)
                 text = f"{seen.reason}, placed by the {run.arm} arm"
                 return succeeded(run, text, hand=placed.gripper, camera=seen)
             run.failure = seen
