@@ -26,12 +26,12 @@ class GraspContext:
 
     Attributes:
         config: Parameters.
-        table: Where objects stand.
+        table: Table that objects stand on.
         hand: Measures of the grippers.
         shoulders: (x, y) of each arm's shoulder, base frame, m.
         looks: Camera of the second look, by the arm whose hand carries it.
-        cameras: At their mounts: the hand carries their housings.
-        hands: By arm; none: `hand` is that of each.
+        cameras: Cameras at their mounts: the hand carries their housings.
+        hands: Hands by arm; none: `hand` is that of each.
     """
 
     config: GraspConfig

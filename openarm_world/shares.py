@@ -59,7 +59,7 @@ def explain(points: Array, T_motion: Array, view: DepthView, config: WorldConfig
         points: (n, 3) on its surface, where it was, base frame, m.
         T_motion: (4, 4) how it has moved since, in the base frame; the identity: it stands.
         view: Depth without the noise of single pixels.
-        config: What counts as seen.
+        config: Thresholds of what counts as seen.
     """
     state = look(points, T_motion, view, config)
     n = max(len(state), 1)
@@ -86,7 +86,7 @@ def fit(
         T_motion: Same as for `explain`.
         view: Same as for `explain`.
         config: Same as for `explain`.
-        turns: Whether it may have turned about the vertical, too, and not only shifted.
+        turns: True if it may have turned about the vertical, too, and not only shifted.
     """
     some = points[:: max(1, len(points) // _POINTS)]
     middle = se3.apply(T_motion, some).mean(axis=0)

@@ -55,14 +55,14 @@ def pick(
     come too near to each other. Options of two objects are given once for each: `--arm left --arm right`.
 
     Args:
-        label: What to pick: its class, colour or shape, such as cola, red or can, or several words such as "red cube
+        label: Object to pick: its class, colour or shape, such as cola, red or can, or several words such as "red cube
             left of the can"; without one, the first object that is detected.
         second: Another object, picked in parallel.
-        arm: Which arm: auto when not given.
+        arm: Arm to use: auto when not given.
         at: x y near the object, base frame, m: selects one of several alike.
-        place: Where to: x y z of the footprint centre, base frame, m (z is not read: the table); chosen when not given.
+        place: Place: x y z of the footprint centre, base frame, m (z is not read: the table); chosen when not given.
             Or on or in something in view: --place on:"blue box", --place in:tray.
-        place_on: What to place it on or in, as --place on:THING.
+        place_on: Object to place it on or in, as --place on:THING.
         yaw: Yaw of the object where it is put down, degrees about the vertical; unconstrained when not given.
         phase: pick ends with the object in the hand, place puts down what the hand holds; all does both. aside pushes
             the object away from where it is.
@@ -252,7 +252,7 @@ def order(
     --bins, each class goes into its bin, on a place that is free.
 
     Args:
-        labels: What to pick, in this order: each words as for `pick`.
+        labels: Objects to pick, in this order: each words as for `pick`.
         bins: YAML with `bins` (rectangles x, y on the table, m), `classes` (bin of a label) and `rest` (bin of others).
         each: Most objects of each label; 0 is all.
         speed: Share of the limits of the joints, as for `pick`.

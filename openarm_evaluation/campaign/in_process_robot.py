@@ -155,7 +155,7 @@ class InProcessRobot:
         """Plan with the motion service.
 
         Raises:
-            OpenArmError: With the planner's code.
+            OpenArmError: Error of the planner.
         """
         start = np.array(request.start if isinstance(request, PlanGrasp) else ())
         if isinstance(request, PlanPlace) and isinstance(request.after, Trajectory):
@@ -193,7 +193,7 @@ class InProcessRobot:
         """Follow a planned trajectory and see that the arm has arrived.
 
         Raises:
-            OpenArmError: As /motion/execute; CANCELLED; ROBOT_LOST; from `guard`.
+            OpenArmError: Same as /motion/execute; CANCELLED; ROBOT_LOST; from `guard`.
         """
         if not isinstance(trajectory, Trajectory):
             raise OpenArmError(Code.INTERNAL, f"{type(trajectory).__name__} is no trajectory of the planner")

@@ -55,10 +55,10 @@ class Trials:
     """Runs the requests of one task.
 
     Args:
-        task: What is asked.
-        senses: How well the robot sees.
+        task: Task to carry out.
+        senses: Noise and settings of the cameras and detectors.
         config: Parameters of the grasp.
-        known: What the suite has found of the robot.
+        known: Calibration of the robot by the suite.
         folder: Gets what is kept of a failure.
         again: The command that runs this task again, for the report.
     """
@@ -214,7 +214,7 @@ class Trials:
         """A request, to be carried out by a strategy.
 
         Args:
-            request: What is asked for.
+            request: Request.
             steps: Gets the states that it enters.
             alone: No other is carried out meanwhile.
         """

@@ -32,9 +32,9 @@ class Drift:
     """What the residuals of a camera come to.
 
     Attributes:
-        camera: Which.
+        camera: Name of the camera.
         bias: (2,) mean residual, base frame, m: where the camera sees objects, less where they are.
-        grasps: How many.
+        grasps: Number of grasps.
         alarm: The bias is large and sure.
         arms: Bias of each arm, m, where they surely differ.
     """
@@ -69,7 +69,7 @@ class DriftWatch:
 
     Args:
         config: When to raise an alarm.
-        camera: That sees the objects.
+        camera: Camera that sees the objects.
     """
 
     def __init__(self, config: DriftConfig, camera: str) -> None:

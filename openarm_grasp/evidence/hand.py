@@ -23,7 +23,7 @@ class HandReader:
     Args:
         description: The robot.
         states: Its joint states.
-        arm: Whose.
+        arm: Arm of the hand.
     """
 
     def __init__(self, description: RobotDescription, states: RobotStateBuffer, arm: str) -> None:
@@ -66,7 +66,7 @@ class HandReader:
 
         Args:
             expected: Width of the object between the fingers, m.
-            effort: Of the finger joint, N or N m.
+            effort: Effort of the finger joint, N or N m.
             T_base_planned: (4, 4) where the TCP should be; None leaves its error 0.
             pads: Force on each finger pad, N; empty without a sensor.
         """

@@ -83,7 +83,7 @@ def judge_grip(
     """Whether the hand holds the object: GRASP_MISSED, when it is empty or moves; HAND_COLLISION; GRASP_LOST.
 
     Args:
-        e: What the gripper says.
+        e: State of the gripper's joint.
         config: Thresholds.
         was_held: The object was held before: an empty hand has lost it.
         apertures: Least and greatest gap around what is no box, m; None: the object is `e.expected` wide. Either within
@@ -146,7 +146,7 @@ def judge_path(start: Array, end: Array, line: Array, least: float) -> HandVerdi
         start: (3,) where the tool centre point was measured before, m.
         end: (3,) where it was measured afterwards, m.
         line: (3,) where it should have gone from there, m.
-        least: How far along it is far enough, m.
+        least: Least distance along it, m.
     """
     along = float((end - start) @ line) / float(np.linalg.norm(line))
     text = f"the hand went {along * 1e3:.0f} mm along its line of {np.linalg.norm(line) * 1e3:.0f} mm"

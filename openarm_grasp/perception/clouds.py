@@ -56,7 +56,7 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
     a part of it may have stayed. A prism is one body, and known down to its foot.
 
     Args:
-        frames: In the base frame.
+        frames: Frames in the base frame.
         sighting: The thing as it stood.
         rise: Its upper end is at least this much higher, of a prism its lower end, m.
     """

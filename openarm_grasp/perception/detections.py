@@ -63,7 +63,7 @@ class Sighting:
         target: The averaged detection.
         others: Every other object, newest sight of each.
         t_ns: Stamp of the newest frame.
-        clouds: Of the newest frames that show the target, with its points labelled 1, those of other
+        clouds: Clouds of the newest frames that show the target, with its points labelled 1, those of other
             detections 2, and all others 0.
     """
 
@@ -115,7 +115,7 @@ def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Fr
     """Frames of detections in the base frame.
 
     Args:
-        frames: In some frame.
+        frames: Frames in some frame.
         lookup: T_base_frame (4, 4) of that frame at a stamp in ns.
     """
     moved: list[Frame] = []
@@ -200,9 +200,9 @@ def find(
     """Choose an object, follow it by its id through all frames, and average it.
 
     Args:
-        frames: At least one, oldest first; every detection has an id.
-        label: What to look for, in words; "" takes any. Of those that fit, the first is taken.
-        limits: How much an object may seem to move.
+        frames: Frames, at least one, oldest first; every detection has an id.
+        label: Object to look for, in words; "" takes any. Of those that fit, the first is taken.
+        limits: Limits of how much an object may seem to move.
         at: (x, y) where it stands, m; None: anywhere.
         exclude_near: (x, y) of objects that are excluded, m.
         placed: Ids of what was placed at some of these positions: where one is in view, it alone is excluded.

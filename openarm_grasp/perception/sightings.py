@@ -63,7 +63,7 @@ def surface_of(one: Detection, found: Sighting) -> float:
 
     Args:
         one: It; of `found.others`.
-        found: What was seen; without points, its top.
+        found: Observed objects; without points, its top.
     """
     points = points_around(found.clouds[-1:])
     points = tops(points[in_box(points, one)])
@@ -83,7 +83,7 @@ def joined(found: Sighting, parts: Sequence[Detection]) -> Sighting:
 
     Args:
         found: The object and what is around it.
-        parts: Of `found.others`.
+        parts: Parts, of `found.others`.
     """
     clouds: list[LabelledCloud] = []
     for cloud in found.clouds:

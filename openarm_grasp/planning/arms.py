@@ -28,9 +28,9 @@ def arm_order(arm: str, y: float, overlap_half_width: float, shoulders: Shoulder
     Args:
         arm: Which, or "auto" (also ""): that whose shoulder is nearest to the object's y, then those that the object is
             midway to.
-        y: Of the object, base frame, m.
+        y: Position of the object along y, base frame, m.
         overlap_half_width: Distance from the middle of two arms up to which both are tried, m.
-        shoulders: Of the arms.
+        shoulders: Shoulders of the arms.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for another arm.

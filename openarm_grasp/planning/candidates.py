@@ -69,11 +69,11 @@ class GraspCandidate:
         width: Extent of the object between the fingers, m.
         tilt: Lean of the approach from straight down, rad.
         score: Higher is tried first; the sum of `parts`.
-        parts: What the score is made of.
+        parts: Terms of the score.
         apertures: Least and greatest aperture that is expected when the hand has closed on what is no box, m; None: it
             is `width`.
-        patch_area: Of the smaller of both contact patches, m2; 0: not known.
-        held: What is grasped, as boxes, base frame; empty: it is the box that was detected.
+        patch_area: Area of the smaller of both contact patches, m2; 0: not known.
+        held: Boxes about what is grasped, base frame; empty: it is the box that was detected.
         opened: Aperture of the hand on the approach and after the release, m; None: wide open.
     """
 
@@ -190,7 +190,7 @@ def propose(
         config: Parameters.
         hand: Measures of the gripper.
         shoulder_xy: (2,) of the arm's shoulder in the base frame, m; leaning away from it reaches furthest.
-        others: What stands around it; hands whose fingers have room come first.
+        others: Objects around it; hands whose fingers have room come first.
         raised: TCP so much higher than it need be, m; nothing is proposed where the pads would leave the object.
 
     Raises:

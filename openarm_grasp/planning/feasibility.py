@@ -30,7 +30,7 @@ class FeasibilityCheck:
     """Ask the planner.
 
     Args:
-        robot: Whose planner.
+        robot: Robot whose planner is asked.
         context: Parameters and where the arms stand.
     """
 
@@ -50,7 +50,7 @@ class FeasibilityCheck:
         """Why an arm cannot pick the object, and put it where it is wanted; None when it can.
 
         Args:
-            arm: Whose.
+            arm: Arm to plan for.
             found: The object and its neighbours.
             place: Footprint centre (x, y), base frame, m; None: the grasp alone is planned.
             yaw: Yaw of the object there; None: unconstrained.
@@ -58,7 +58,7 @@ class FeasibilityCheck:
             offered: Grasps of it there; None: they are searched.
 
         Raises:
-            OpenArmError: What the robot raises, when it was not found out.
+            OpenArmError: Error of the robot, when it was not found out.
         """
         try:
             if place is None:
@@ -92,7 +92,7 @@ class FeasibilityCheck:
         """Plan a grasp, and how it ends on one of the spots; others are tried when one cannot be put down.
 
         Args:
-            arm: Whose.
+            arm: Arm to plan for.
             found: The object and its neighbours.
             spots: (3,) footprint centres on what it is to stand on, best first.
             yaw: Yaw of the object there; None: unconstrained.

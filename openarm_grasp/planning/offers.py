@@ -33,7 +33,7 @@ def offers(
         failed: Grasps of it that have failed.
 
     Raises:
-        OpenArmError: As `openarm_grasp.sampling.samplers.GraspSampler`.
+        OpenArmError: Same as `openarm_grasp.sampling.samplers.GraspSampler`.
     """
     name = context.config.sampler
     sampler, target = _sampler(name), sighting.target

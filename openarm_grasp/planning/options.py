@@ -43,8 +43,8 @@ class Option:
         id: Id of the candidate; label and edge for an edge that the hand does not fit across.
         arm: Arm of the hand.
         score: The higher is preferred; the sum of `parts`.
-        parts: What the score is made of.
-        limit_margin: How near it comes to a joint limit on the way down and up again, rad; NaN: not known.
+        parts: Terms of the score.
+        limit_margin: Least distance to a joint limit on the way down and up again, rad; NaN: not known.
         code: OK: chosen; "": not needed, another was chosen; else why it was refused.
         message: The same in words.
     """

@@ -54,7 +54,7 @@ def place_targets(
 
     Args:
         target: The object as it stood at the grasp.
-        candidate: How it is held.
+        candidate: Grasp that holds it.
         spots: (3,) footprint centres on what it is to stand on, base frame, m, best first; (2,): as high as it stood.
         config: Parameters.
         used: Targets that have failed before: their spots (where there are others) or turns come last.
@@ -104,7 +104,7 @@ def other_grasps(
         failed: The one that it chose.
         code: Why the place was refused.
         target: The object as it stands.
-        yaw: How it is wanted, rad; None: any.
+        yaw: Yaw that is wanted, rad; None: any.
     """
     if code is Code.NO_PLAN:
         return tuple(c for c in offered if hold_of(c) != hold_of(failed))
@@ -180,10 +180,10 @@ def free_spots(
         target: The object as it stood at the grasp.
         others: Other objects in view.
         config: Parameters.
-        shoulders: Of the arms.
+        shoulders: Shoulders of the arms.
         choices: (x, y) of spots, base frame, m; none: a grid on the arm's side.
         seen: (n, 3) points of the table that are in view: spots that nothing hides come first; None: all are.
-        every: As many as there are, not only `config.place.spots`.
+        every: All that there are, not only `config.place.spots`.
 
     Raises:
         OpenArmError: PLACE_FAILED, when nothing is free.
@@ -255,7 +255,7 @@ def check_position(position: Sequence[float], target: Detection, others: Sequenc
         position: x, y (and a z that is not read), base frame, m.
         target: The object that is to stand there.
         others: Other objects in view.
-        table: Whose top it must be on.
+        table: Table whose top it must be on.
 
     Returns:
         (2,) position.
@@ -336,7 +336,7 @@ def placing_error(label: str, target: PlaceTarget, frame: Frame) -> tuple[Array,
 
     Args:
         label: Label of the object.
-        target: Where it was let go.
+        target: Target where it was let go.
         frame: Observed since.
 
     Returns:

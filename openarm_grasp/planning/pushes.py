@@ -55,7 +55,7 @@ class Sweep:
         freed: (2,) where the object should be afterwards.
         heap: Boxes about the object and all that is pushed along with it, as far as it is at the height of the hand.
         under: Boxes about the same down to the table.
-        rest: What else stands around.
+        rest: Other objects around.
     """
 
     met: Detection
@@ -84,9 +84,9 @@ def sweeps(
         found: The object and its neighbours.
         hand: Points (n, 3) of the closed hand, TCP frame.
         context: Parameters and table.
-        lengths: Of the way of the object, m.
+        lengths: Lengths of the way of the object, m.
         level: Height of the hand above the table, m: it goes over what is lower, and meets what lies on that.
-        longest: Of lines that move as many things the longest come first, else short ones that lead outwards.
+        longest: Try the longest first of lines that move as many things, else short ones that lead outwards.
     """
     config, table = context.config, context.table.top_z
     floor, around = table + level, points_around(found.clouds)
@@ -148,7 +148,7 @@ def _line(
 
     Args:
         things: (n, 3) columns of each; x along the line.
-        half: Of the width that the hand takes, m.
+        half: Half of the width that the hand takes, m.
         room: Free length that it needs to come down, m.
         length: Length of the way of the first thing, m.
 
@@ -211,7 +211,7 @@ def destinations(target: Detection, others: Sequence[Detection], context: GraspC
 
     Args:
         target: The object.
-        others: What else stands on the table.
+        others: Other objects on the table.
         context: Parameters and table.
     """
     config, place, table = context.config.push, context.config.place, context.table
@@ -247,8 +247,8 @@ def push_ways(
         end: (2,) where it should be pushed.
         config: Parameters.
         hand: Points (n, 3) of the closed hand, TCP frame.
-        measures: Of the hand.
-        turns_deg: Of the hand about the vertical against that, deg.
+        measures: Measures of the hand.
+        turns_deg: Turns of the hand about the vertical against that, deg.
     """
     way = np.array([*(end - target.p_base[:2]), 0.0])
     ahead = direction(way)
@@ -313,7 +313,7 @@ def _front(points: Array, ahead: Array, half_width: float, height: tuple[float, 
     Args:
         points: (n, 3) of the hand's surface, axes of the base, from the TCP.
         ahead: (3,) direction.
-        half_width: Of the object, across that direction, m.
+        half_width: Half of the object's width across that direction, m.
         height: Height of the object's lower and upper face above the TCP, m.
     """
     across = np.abs(points @ np.cross(UP, ahead))

@@ -102,9 +102,9 @@ def proposed(
         target: The object as it is seen now.
         config: Parameters.
         hand: Measures of the gripper.
-        failed: What has failed so far.
-        shoulder_xy: As of `propose`.
-        others: As of `propose`.
+        failed: Grasps that have failed so far.
+        shoulder_xy: Same as for `propose`.
+        others: Same as for `propose`.
 
     Raises:
         OpenArmError: TOO_WIDE, when no side fits into the hand.
@@ -132,7 +132,7 @@ def among(offered: Sequence[GraspCandidate], target: Detection, failed: Sequence
     Args:
         offered: Best first.
         target: The object as it is seen now.
-        failed: What has failed so far.
+        failed: Grasps that have failed so far.
     """
     if not failed:
         return Ways(tuple(offered), ())
@@ -166,7 +166,7 @@ def centre_of_mass(solid: Array, target: Detection, failed: Sequence[FailedGrasp
     Args:
         solid: (n, 3) points that fill it, base frame.
         target: The object as it is seen now.
-        failed: What has failed so far.
+        failed: Grasps that have failed so far.
 
     Returns:
         (3,) base frame.

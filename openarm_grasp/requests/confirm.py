@@ -33,8 +33,8 @@ class ShownPlan:
     """A plan that waits for a person.
 
     Attributes:
-        id: To confirm or reject it by.
-        arm: That would move.
+        id: Id to confirm or reject it by.
+        arm: Arm that would move.
         parts: Name and trajectory of each part, in their order.
     """
 
@@ -94,12 +94,12 @@ async def agree(
     """Show plans that follow each other as one and wait until a person has confirmed it; nothing without `confirm`.
 
     Args:
-        task: What is asked for.
-        arm: That would move.
-        text: What it does, in a sentence.
+        task: Task that it is a part of.
+        arm: Arm that would move.
+        text: Sentence on what it does.
         plans: Names of the parts of each, and the plan.
         show: Reports it.
-        standing: What must still be seen where it stands when it is confirmed, and nothing new; empty: not looked at.
+        standing: Objects that must still be seen there when it is confirmed, and nothing new; empty: not looked at.
 
     Returns:
         Why it may not be executed any more; "" when it may.
@@ -131,10 +131,10 @@ async def outdated(robot: Skills, plans: Sequence[Planned], start: Mapping[str, 
     """Why plans do not hold any more; "" when they do.
 
     Args:
-        robot: That would execute them.
-        plans: In their order.
-        start: Where the joints must be, rad by name.
-        tolerance: How far from it they may be, rad.
+        robot: Robot that would execute them.
+        plans: Plans in their order.
+        start: Joint positions at the start, rad by name.
+        tolerance: Largest distance of a joint from there, rad.
     """
     version, joints = await robot.scene_version(), robot.joints()
     for plan in plans:
@@ -151,9 +151,9 @@ def changed(standing: Sequence[Detection], frames: Sequence[Frame], limit: float
     """How what stands on the table differs from what was planned for; "" when it does not.
 
     Args:
-        standing: What was planned for.
+        standing: Objects that it was planned for.
         frames: Seen since; a detector may miss an object in one.
-        limit: How far an object may be from its place, m.
+        limit: Largest distance of an object from its place, m.
         table_z: Height of the table, m.
     """
     for one in standing:

@@ -98,7 +98,7 @@ class Left:
 
     Attributes:
         label: Words that it was asked for by.
-        where: Where it was seen, base frame, m; None: that is not known.
+        where: Position where it was seen, base frame, m; None: that is not known.
         code: Why it was left.
         why: Why, in a sentence.
         after: Requests by then after which things lay, or were seen, otherwise.
@@ -123,7 +123,7 @@ class _InVain:
     """A request that placed nothing.
 
     Attributes:
-        request: What was asked for.
+        request: Request that was made.
         code: Code of the answer.
         touched: An arm has moved for it.
         seen: The object was seen.
@@ -154,11 +154,11 @@ class Order:
 
     Attributes:
         labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
-        bins: Where they go; None: to free spots.
+        bins: Bins that they go into; None: to free spots.
         each: Most objects of one label, or of each label; 0: all.
         arms: Arms that work at the same time; fewer than two: one request at a time.
         placed: Labels that were placed, in order.
-        left: What could not be taken.
+        left: Objects that could not be taken.
         failed: Labels that could not be asked for, or were never there, and why.
         running: Requests that are being carried out.
     """
@@ -327,7 +327,7 @@ class Order:
         """Note what came of a request, and return what it leaves; None for nothing that was not left before.
 
         Args:
-            request: From `next`.
+            request: Request from `next`.
             code: Code of the answer.
             message: Message of the answer.
             placed: (x, y) where the object stands now, when it was placed.

@@ -32,7 +32,7 @@ class GraspRequest:
     """A request of a user.
 
     Attributes:
-        label: What to pick, in words; "" takes the first detection.
+        label: Object to pick, in words; "" takes the first detection.
         arm: "auto", "left" or "right".
         place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
         dry_run: Plan and report, do not move.
@@ -46,9 +46,9 @@ class GraspRequest:
         exclude_near: (x, y) of objects that stay where they are, base frame, m.
         placed: Ids of what was placed at some of these positions.
         place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
-        why: What it is for, when it is a part of another request.
+        why: Purpose, when it is a part of another request.
         same: The object, when an earlier part of the request was about it: as it was seen or left then.
-        place_on: What it is to stand on or in, in words; "": the table.
+        place_on: Object that it is to stand on or in, in words; "": the table.
     """
 
     label: str
@@ -109,7 +109,7 @@ class GraspRequest:
         """Refuse an arm, a phase or a speed that does not exist, and a long text.
 
         Args:
-            arms: Of the robot.
+            arms: Arms of the robot.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT.
@@ -161,8 +161,8 @@ class Proof:
     """Why a request counts as done: two kinds of evidence that do not depend on each other.
 
     Attributes:
-        hand: That the hand held the object, or pushed it along.
-        camera: That the object has left its place, or is seen where it was to be placed.
+        hand: Verdict that the hand held the object, or pushed it along.
+        camera: Verdict that the object has left its place, or is seen where it was to be placed.
 
     Raises:
         OpenArmError: INTERNAL, when one of them says otherwise.
@@ -190,8 +190,8 @@ class GraspOutcome:
 
     Attributes:
         code: OK, or what went wrong.
-        message: What happened, in a sentence or two.
-        label: What was picked (or asked for).
+        message: A sentence or two on what happened.
+        label: Label of the object that was picked (or asked for).
         arm: The arm that was used, or "".
         attempts: Physical attempts.
         place_position: (3,) target that was used, base frame, m; zeros when none.
@@ -200,7 +200,7 @@ class GraspOutcome:
         duration: s of robot time.
         held: The object is in the hand.
         moved: It is elsewhere than before, and not where it was asked for; the message says where.
-        route: How it was done: "direct", "hand_over", "push", "aside" or another strategy; "" when it was not.
+        route: Strategy that did it: "direct", "hand_over", "push", "aside" or another one; "" when it was not done.
         options: Grasps that were considered for the newest plan, by arm, the preferred first.
         state_times: Time spent in each state.
         recording: Path of the flight recording of a failure; "" when there is none.
@@ -252,9 +252,9 @@ class PairOutcome:
     """The answer to two requests.
 
     Attributes:
-        answers: To each, in their order; none when they were not taken.
+        answers: Answers in the order of the requests; none when they were not taken.
         code: OK, or of the first that failed; CANCELLED, when one of them was.
-        message: What happened to each.
+        message: Sentences on each.
         simultaneous: Both arms worked at the same time.
         duration: s of robot time.
         recording: Path of the flight recording of a failure; "" when there is none.

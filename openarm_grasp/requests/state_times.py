@@ -17,7 +17,7 @@ class StateTime:
     Attributes:
         state: Its name.
         duration: Duration of all visits, s.
-        budget: Of a visit, s; 0: none.
+        budget: Budget of a visit, s; 0: none.
         longest: Visit, s, without the time that a person took to confirm a plan.
     """
 
@@ -55,7 +55,7 @@ class StateClock:
         """Note that a state is entered.
 
         Args:
-            state: Which.
+            state: State that is entered.
             t_ns: When.
             waits: A person is waited for, until the next is entered.
 

@@ -42,13 +42,13 @@ class Grasp:
     Attributes:
         arm: Arm of the hand.
         sighting: The object and its neighbours before the grasp.
-        candidate: How the hand takes hold.
+        candidate: Pose and aperture of the hand.
         places: Ways to put the object down.
         closed: Aperture after the hand had closed on what is no box, m; None: it was not, or it is a box.
         turned: The camera has seen it turned or slipped in the hand, which does not put it where it should be then.
         heavy: (2,) direction of the end that hung lower than it should, base frame, as the object lay; None: not seen.
-        adjacent: What lay so near that it may be a part of it.
-        merged: What was seen as another thing among others and rose with it: both may be one, or be held together.
+        adjacent: Objects that lay so near that they may be parts of it.
+        merged: Objects that were seen as others and rose with it: they may be one with it, or be held together.
     """
 
     arm: str
@@ -86,9 +86,9 @@ class Placed:
     """An object that was put down.
 
     Attributes:
-        target: Where.
-        gripper: That the hand held it above that place.
-        reason: How it was put down.
+        target: Target of the place.
+        gripper: Verdict that the hand held it above that place.
+        reason: Sentence on how it was put down.
         failure: Why it was put back where it came from, or let go on the way; None when it was put where it belongs.
     """
 
@@ -259,15 +259,15 @@ class Status:
         attempt: 1-based number of the attempt, 0 when none runs.
         label: Label of the object, "" while none is known.
         arm: The arm in use, "" while none is chosen.
-        request: Which of the requests that run at the same time, 0 or 1.
+        request: Number of the request among those that run at the same time, 0 or 1.
         failed: The attempt, or what was observed for it, has failed.
         candidates: Grasps that the planner chooses from; in PLAN and MOVE_TO_PREGRASP.
         chosen: Id of the one that was chosen, or "".
         refused: Ids of those that were refused.
-        plan: That waits for a person.
+        plan: Plan that waits for a person.
         code: Code of the request, when it has ended.
         budget: Longest time that this state is expected to take, s; 0: none.
-        late: That the state before took longer than expected, or "".
+        late: Sentence that the state before took longer than expected, or "".
     """
 
     state: State
@@ -316,11 +316,11 @@ class Task:
     """A request of a user while strategies carry it out.
 
     Args:
-        session: What outlives the request.
+        session: Session that outlives the request.
         robot: Carries out.
-        request: What is asked for.
+        request: Request.
         report: Called at each state that is entered.
-        index: Which of the requests that run at the same time, 0 or 1.
+        index: Number of the request among those that run at the same time, 0 or 1.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ class ArmCoordination:
     """What the robots of both arms share.
 
     Attributes:
-        at_work: What each arm is at work on, by arm; others rest.
+        at_work: Work of each arm, by arm; others rest.
         waiting: Arms that wait until the other goes on.
         observing: The arm that observes; "" when none does.
         seen: Newest frames of the camera over the table, by the arm that observed.
@@ -70,7 +70,7 @@ class CoordinatedRobot:
     """Implements the robot's interface for one request of one arm while the other may work, too; use `coordinated`.
 
     Args:
-        arm: Which.
+        arm: Arm of this robot.
         robot: The robot, for this arm alone.
         coordination: Shared with the other arm's.
         config: Parameters.

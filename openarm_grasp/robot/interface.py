@@ -29,7 +29,7 @@ class PlanGrasp:
 
     Attributes:
         target: The object, as one box or several, base frame; the fingers may touch it, and it goes with the hand.
-        ignore_regions: Where the object will not stand any more then: the map still shows it there.
+        ignore_regions: Regions that the object will have left by then: the map still shows it there.
         start: Joints that it starts from: of the lift, then of the arm, rad and m; empty: the present ones.
         velocity_scale: Share of the speed of other motions.
         blend: The transfer goes on to the grasp without a stop, as it does to a place.
@@ -50,9 +50,9 @@ class PlanPlace:
     """Choose and plan one of the place targets; result `Planned`.
 
     Attributes:
-        held: What the hand carries, as one box or several, TCP frame.
+        held: Boxes of what the hand carries, TCP frame.
         after: Trajectory whose end is the start; None starts at the present joints.
-        ignore_regions: Where the object stood: the map may not know yet that it was taken away.
+        ignore_regions: Regions that the object has left: the map may still show it there.
         velocity_scale: Share of the speed of other motions.
     """
 

@@ -139,11 +139,11 @@ class Skills:
 
         Args:
             motion: Motion of the arm.
-            near_end: Whether it is near enough to its end.
+            near_end: True when it is near enough to its end.
             work: Done then.
 
         Raises:
-            OpenArmError: As the motion, then as the work.
+            OpenArmError: Same as the motion, then as the work.
         """
         ended = list[bool]()
 
@@ -193,7 +193,7 @@ class Skills:
         """Plan one of several grasps.
 
         Args:
-            arm: Whose.
+            arm: Arm to plan for.
             ways: The candidates.
             found: The object and its neighbours.
             now: The object where it stands until then, when that is elsewhere: the map shows it there.
@@ -220,9 +220,9 @@ class Skills:
         """Plan a closed hand that pushes one thing, or several, slowly.
 
         Args:
-            arm: Whose.
+            arm: Arm to plan for.
             ways: The candidates.
-            found: What stands around them.
+            found: Objects around them.
             pushed: Boxes about them, as far as the hand meets them.
             under: Boxes about all of them: what the map shows there is no obstacle.
         """
@@ -243,10 +243,10 @@ class Skills:
         """Plan how to put the object down; the map may still show it where it was, or below the hand that lifted it.
 
         Args:
-            arm: Whose.
-            ways: To put the object down.
+            arm: Arm to plan for.
+            ways: Ways to put the object down.
             found: The object before the grasp, and its neighbours.
-            candidate: How the hand holds it.
+            candidate: Grasp that holds it.
             after: Trajectory whose end is the start; None starts at the present joints.
             turned: It has turned in the hand: the map shows it around the hand, and how it hangs is not known.
             in_part: There may be more of it than was seen: the map shows that around the hand.
@@ -292,9 +292,9 @@ class Skills:
         """Follow a planned trajectory.
 
         Args:
-            arm: Which.
+            arm: Arm to move.
             trajectory: Trajectory of the planner.
-            what: For errors, for example "lift".
+            what: Name of the motion for errors, for example "lift".
             carrying: A hand that closes or slips stops it.
             line: Ends (3,) of the straight line that the TCP follows at last, base frame, m; leaving it by more than
                 `path_tolerance` stops it.
@@ -379,7 +379,7 @@ class Skills:
         """Move the arms that are not there to their home posture, one after the other.
 
         Args:
-            arms: Which.
+            arms: Arms to move.
             obstacles: Boxes to keep clear of, base frame.
             back_off_below: A hand lower than this (z, base frame, m) may be among the objects and first backs off along
                 its own approach axis.
@@ -461,7 +461,7 @@ class Skills:
 
         Args:
             arm: Arm of the hand.
-            what: For errors, for example "release".
+            what: Name of the motion for errors, for example "release".
             aperture: Distance between the fingers, m; None: wide open.
             held: Gap at which it holds something, m: `lets_go` more is enough, as other things may stop the fingers.
 
@@ -493,7 +493,7 @@ class Skills:
 
         Args:
             arm: Arm of the hand.
-            what: For errors, for example "close".
+            what: Name of the motion for errors, for example "close".
             force: Largest, N; 0: the driver's limit.
 
         Raises:

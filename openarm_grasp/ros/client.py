@@ -37,7 +37,7 @@ class GraspResult(Answer):
 
     Attributes:
         outcome: SUCCESS; PARTIAL: held, not placed as asked; FAILED; REFUSED: never touched; CANCELLED.
-        label: What was picked.
+        label: Label of the object that was picked.
         arm: The arm that was used, or "".
         attempts: Physical attempts.
         place_position: (x, y, z) of the target on the table, base frame, m.
@@ -74,7 +74,7 @@ class PairResult(Answer):
         outcome: SUCCESS; PARTIAL: one of them, or picked and not placed as asked; FAILED; REFUSED: none was touched;
             CANCELLED.
         simultaneous: Both arms moved at the same time.
-        results: Of each, in the order asked; none when they were not taken.
+        results: Results in the order asked; none when they were not taken.
         duration: s of robot time.
         recording: Path of the flight recording of a failure; "" when there is none.
     """
@@ -123,11 +123,11 @@ class GraspClient(BackgroundNode):
         """Pick an object and place it; returns when that has ended, well or not.
 
         Args:
-            label: What to pick; "" takes the detection with the highest score.
+            label: Object to pick, in words; "" takes the detection with the highest score.
             arm: "auto", "left" or "right".
             place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
                 chosen.
-            place_yaw: Of the object's x axis about the base z where it is put down, rad; None: unconstrained.
+            place_yaw: Yaw of the object's x axis about the base z where it is put down, rad; None: unconstrained.
             object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
             exclude_near: (x, y) of objects that stay where they are.
             place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
@@ -206,7 +206,7 @@ class GraspClient(BackgroundNode):
             The result; `raise_for_code` turns a failure into an exception.
 
         Raises:
-            OpenArmError: As `pick`.
+            OpenArmError: Same as `pick`.
         """
         goal = PickTwo.Goal(dry_run=dry_run, timeout=time_limit, velocity_scale=speed)
         for request, wanted in zip(goal.requests, (first, second), strict=True):

@@ -34,8 +34,8 @@ class FlightRecorderClient:
         """Return the path of the recording of a failure; "" for a success, for a plan alone, and when nobody records.
 
         Args:
-            outcome: How it ended.
-            requests: What was asked for: one object, or two at once.
+            outcome: Outcome of the request.
+            requests: Requests: one, or two at once.
         """
         if outcome.kind in ("SUCCESS", "CANCELLED") or outcome.code in _OF_REQUEST or requests[0].dry_run:
             return ""

@@ -153,7 +153,7 @@ class GraphClients:
         Args:
             done: The condition.
             limit: s of wall clock.
-            what: What is waited for, for the error.
+            what: Description of the condition, for the error.
             guard: Called at each check; may raise.
 
         Raises:

@@ -68,7 +68,7 @@ class GraphRobot:
         """Listen to the robot and wait until every node that a grasp needs is there.
 
         Args:
-            what: That is carried out, for other clients of the arms.
+            what: Description of the work, for other clients of the arms.
             arms: Those that it will move.
 
         Raises:

@@ -253,7 +253,7 @@ def planned_from_msg(result: PlanApproach.Result, offered: int, *, blend: bool =
     """A plan, blended or not, or why there is none.
 
     Raises:
-        OpenArmError: With the planner's code, when it found no plan; INTERNAL, when it chose what was not offered.
+        OpenArmError: the planner's code, when it found no plan; INTERNAL, when it chose what was not offered.
     """
     refusals = {r.id: Verdict(code_from_text(r.code, Code.NO_PLAN), r.message) for r in result.refusals}
     if not result.success:
@@ -333,11 +333,11 @@ def move_goal(
     """A free path to a named posture, or to joint positions, or a straight line of the TCP to a pose.
 
     Args:
-        arm: Which.
+        arm: Arm to move.
         frame: Base frame.
         to: Name of the posture, joint positions (n,), or the pose (4, 4), base frame.
         obstacles: Boxes to keep clear of, base frame.
-        velocity_scale: Of the motion limits; 0: the planner's default.
+        velocity_scale: Share of the motion limits; 0: the planner's default.
         max_start_delay: Longest start delay until the other arm leaves clearance, s.
     """
     goal = MoveArm.Goal(

@@ -271,11 +271,11 @@ class GraspNode(BaseNode[GraspConfig]):
         """Carry something out with arms that are free.
 
         Args:
-            what: What it is.
-            arms: Which.
+            what: Description of the work.
+            arms: Arms that it needs.
             work: Carries it out.
             robots: Those that a cancel of the goal reaches; none: the one of all arms.
-            goal: That asks for it; None: a service does.
+            goal: Goal that asks for it; None: a service does.
             moves: It will move arms.
 
         Raises:

@@ -69,10 +69,10 @@ class Antipodal:
         T_base_tcp: (4, 4).
         width: Extent between the pads, m.
         apertures: Least and greatest aperture that the closed hand may have, m.
-        patch_area: Of the smaller patch, m2.
+        patch_area: Area of the smaller patch, m2.
         tilt: Tilt of the approach from straight down, rad.
         score: The sum of `parts`.
-        parts: What it is made of.
+        parts: Terms of the score.
         opened: Aperture of the hand on its approach, m; None: wide open.
     """
 
@@ -104,7 +104,7 @@ class Search:
     """Looks for grasps of one hand on one surface.
 
     Args:
-        surface: Where.
+        surface: Surface to grasp on.
         shape: Shape of the hand.
         config: Parameters of the search.
         approach: Distance and tilts.

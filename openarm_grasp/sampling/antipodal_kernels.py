@@ -322,7 +322,7 @@ def search(
         back: Length of the straight approach.
         centre: (3,) of mass.
         widest: Voxels.
-        least_cos: Of the friction cone.
+        least_cos: Cosine of the friction cone.
         per_kind: Good poses of one kind.
         enough: Good poses.
         most: Poses that are tried.

@@ -71,9 +71,9 @@ class HandShape:
         """Measure the hand of an arm.
 
         Args:
-            robot: Whose.
+            robot: Robot of the hand.
             arm: Its name.
-            cameras: At their mounts; those with a housing on the hand are part of it.
+            cameras: Cameras at their mounts; those with a housing on the hand are part of it.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the robot has no hand, or its fingers no shape or no pads.

@@ -42,7 +42,7 @@ class Sampling:
         target: The object.
         config: Parameters.
         hand: Measures of the gripper.
-        others: What stands around it.
+        others: Objects around it.
         shoulder_xy: (2,) of the arm's shoulder in the base frame, m.
         surface: The object and what is around it, as cameras saw it; None: only the boxes are known.
         shape: Shape of the open hand with the cameras that it carries; needed with a surface.
@@ -158,8 +158,8 @@ def refine(candidate: GraspCandidate, asked: Sampling) -> tuple[GraspCandidate, 
     are searched.
 
     Args:
-        candidate: That the hand is before now.
-        asked: With the surface that all views were fused into.
+        candidate: Grasp that the hand is before now.
+        asked: Input with the surface that all views were fused into.
 
     Returns:
         Candidates near it, best first; empty when the hand has no room.

@@ -68,7 +68,7 @@ class Surface:
         obstacles: (nx, ny, nz) of the hand: 1 within a voxel of something, 2 the target's shadow, 3 other shadow.
         normals: (nx, ny, nz, 3) outward, of voxels in and next to the target; else 0.
         points: (n, 3) of the target, as they were seen.
-        views: How many cameras it is from.
+        views: Number of cameras that it is from.
     """
 
     low: Array
@@ -120,10 +120,10 @@ def fuse(views: Sequence[View], table_z: float, *, step: float = VOXEL, around: 
     """Put together what cameras see of one object.
 
     Args:
-        views: At least one.
+        views: Views, at least one.
         table_z: Height of the table top, m.
         step: Edge of a voxel, m.
-        around: What stands farther from the object is left out, m.
+        around: Distance from the object beyond which points are left out, m.
 
     Raises:
         OpenArmError: NOTHING_DETECTED, when fewer than 20 points of the object are above the table; INVALID_ARGUMENT,

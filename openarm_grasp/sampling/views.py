@@ -23,7 +23,7 @@ def views_of(clouds: Sequence[LabelledCloud], table_z: float) -> tuple[View, ...
     """Return what each camera has seen of an object and around it, its images put together.
 
     Args:
-        clouds: As of a `Sighting`; the first is of the camera over the table, which looks at all around the object.
+        clouds: Clouds of a `Sighting`; the first is of the camera over the table, which looks at all around the object.
         table_z: Height of the table top.
     """
     cameras: list[list[LabelledCloud]] = []

@@ -207,7 +207,7 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
     """Plan the grasp, and the place where one is asked for or nothing may move; with each arm that may reach.
 
     Raises:
-        NoGraspError: With what each arm lacks.
+        NoGraspError: the reason of each arm.
         OpenArmError: When the place is not one, or the object does not fit into a hand.
     """
     request, target, table = run.request, sighting.target, run.context.table

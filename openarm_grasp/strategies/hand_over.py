@@ -124,7 +124,7 @@ async def plan_hand_over(task: Task, seen: Sighting) -> HandOver:
     again. A place from which the taker could go on, but not from all around it, is the last resort.
 
     Args:
-        task: What is asked for.
+        task: Request.
         seen: The object and its neighbours.
 
     Raises:

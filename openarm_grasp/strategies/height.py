@@ -32,9 +32,9 @@ class Height:
 
     Attributes:
         position: Position of the lift, m.
-        present: Where it is, m.
-        arm: That grasps there.
-        plan: Of the grasp.
+        present: Present position, m.
+        arm: Arm that grasps there.
+        plan: Plan of the grasp.
     """
 
     position: float

@@ -41,10 +41,10 @@ class Pair:
     """Two requests of a user while strategies carry them out.
 
     Attributes:
-        session: What outlives the requests.
+        session: Session that outlives the requests.
         robot: Carries out what is done with one arm at a time.
         robots: Interface for each arm while both work.
-        requests: What is asked for.
+        requests: Both requests.
         report: Called at each state that is entered.
         carry_out: Carries out one of the requests alone, by whatever strategy.
         reason: Why both are, or are not, carried out at the same time.
@@ -221,7 +221,7 @@ def _pairs(requests: Requests, frames: Sequence[Frame], limits: DetectConfig) ->
     """Two objects, the best for each request first; then others that the words of the second request fit.
 
     Raises:
-        OpenArmError: As `GraspRequest.find`; UNKNOWN_OBJECT, when both requests fit one object alone.
+        OpenArmError: Same as `GraspRequest.find`; UNKNOWN_OBJECT, when both requests fit one object alone.
     """
     first, second = (request.find(frames, limits) for request in requests)
     if first.target.id == second.target.id:

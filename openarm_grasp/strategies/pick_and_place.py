@@ -58,8 +58,8 @@ async def pick_and_place(task: Task, request: GraspRequest) -> GraspOutcome:
     """Carry out a request with one arm, from beginning to end.
 
     Args:
-        task: That it is a part of.
-        request: What is asked for.
+        task: Task that it is a part of.
+        request: Request.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT or NOT_READY, when the request is not taken; TIMEOUT, when no time is left.
@@ -142,9 +142,9 @@ def succeeded(run: Run, message: str, *, hand: HandVerdict, camera: CameraVerdic
 
     Args:
         run: The request.
-        message: How, in a sentence.
-        hand: That the hand held the object, or pushed it along.
-        camera: That the object has left its place, or is seen where it was to be placed.
+        message: A sentence on how it was done.
+        hand: Verdict that the hand held the object, or pushed it along.
+        camera: Verdict that the object has left its place, or is seen where it was to be placed.
 
     Raises:
         OpenArmError: INTERNAL, when one of them says otherwise.
@@ -238,7 +238,7 @@ async def close(run: Run, grasp: Grasp, why: str) -> tuple[Grasp, str]:
         The grasp, with the aperture after closing when the object is no box, and the reason.
 
     Raises:
-        OpenArmError: With the code of the grip, when they do not hold it.
+        OpenArmError: the code of the grip, when they do not hold it.
     """
     arm, c, robot, timing = grasp.arm, grasp.candidate, run.robot, run.config.timing
     run.enter(State.CLOSE_GRIPPER, why)
@@ -388,9 +388,9 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
 
     Args:
         run: The request.
-        grasp: What holds it.
-        ways: To put it down.
-        why: For the report.
+        grasp: Grasp that holds it.
+        ways: Ways to put it down.
+        why: Reason, for the report.
         last: The hand keeps it when this fails: it is let go where it meets something on its way down, too.
     """
     arm, robot = grasp.arm, run.robot

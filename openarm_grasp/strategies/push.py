@@ -90,7 +90,7 @@ async def _plan(task: Task, found: Sighting, avoid: Sequence[Array]) -> Push:
     """A push into reach; in a crowd, where there is none, one through it.
 
     Args:
-        task: That it is a part of.
+        task: Task that it is a part of.
         found: The object and its neighbours.
         avoid: (2,) directions in which a push did not move it, or from which one has.
 

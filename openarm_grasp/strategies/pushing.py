@@ -44,9 +44,9 @@ class Push:
         arm: Arm of the hand.
         start: (2,) where the object stands.
         end: (2,) where it should stand afterwards.
-        way: How the hand stands behind it, and its line.
+        way: Pose of the hand behind it, and its line.
         plan: The trajectories.
-        why: What it is good for.
+        why: Purpose of the push.
     """
 
     arm: str
@@ -82,11 +82,11 @@ async def plan_sweep(
     """Find a line that pushes an object along with what it meets; off what it lies on, where the table leaves no room.
 
     Args:
-        task: That it is a part of.
+        task: Task that it is a part of.
         found: The object and its neighbours.
         avoid: (2,) directions in which a push did not move it, or from which one has.
-        lengths: Of its way, m.
-        longest: Of lines that move as many things the longest is tried first, else short ones that lead outwards.
+        lengths: Lengths of its way, m.
+        longest: Try the longest first of lines that move as many things, else short ones that lead outwards.
 
     Raises:
         OpenArmError: UNREACHABLE, with the reason, when there is none; what the robot raises.
@@ -138,10 +138,10 @@ async def carry_out_push(
     """Push, go home and observe.
 
     Args:
-        task: That it is a part of.
+        task: Task that it is a part of.
         planned: The push.
         found: The object and its neighbours before.
-        number: Of the push, 1-based.
+        number: Number of the push, 1-based.
 
     Returns:
         The object as it was observed, a sentence, whether the hand has gone as far as what follows it has moved, and

@@ -27,9 +27,9 @@ class Run:
     """What has been learned since the request came.
 
     Args:
-        task: That this is a part of.
-        request: What is asked for; a retry keeps to the same object.
-        kept: What a hand kept from an earlier request, when it is this one's to place.
+        task: Task that this is a part of.
+        request: Request; a retry keeps to the same object.
+        kept: Grasp of an earlier request that still holds, when it is this one's to place.
     """
 
     def __init__(self, task: Task, request: GraspRequest, kept: Grasp | None) -> None:
@@ -137,11 +137,11 @@ class Run:
         """Begin the next attempt at the same object, the failed grasp remembered; returns why.
 
         Args:
-            grasp: That has failed.
-            placed: Where the object was put down, when it was.
+            grasp: Grasp that has failed.
+            placed: Place where the object was put down, when it was.
 
         Raises:
-            OpenArmError: With the failure, when no attempt is left or another would not help.
+            OpenArmError: the failure, when no attempt is left or another would not help.
         """
         failure = self.failure or Verdict(Code.INTERNAL, "an attempt ended without a failure")
         same = grasp.sighting

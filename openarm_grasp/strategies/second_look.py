@@ -25,8 +25,8 @@ async def second_look(run: Run, grasp: Grasp, camera: str, least: float) -> tupl
 
     Args:
         run: The request.
-        grasp: That is planned.
-        camera: On the hand.
+        grasp: Grasp that is planned.
+        camera: Camera on the hand.
         least: Smaller corrections are not made, m.
 
     Returns:

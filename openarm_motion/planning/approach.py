@@ -197,7 +197,7 @@ def plan_approach(
     Args:
         arm: The arm.
         now: The robot's state, where the arm starts, the velocity scale.
-        request: What is asked.
+        request: Request.
         report: Called with "checking" or "planning" and the number of targets checked so far.
 
     Raises:

@@ -91,7 +91,7 @@ class PlanningGroup(ABC):
     """Joints that are planned together: those of one arm, or of two as one.
 
     Attributes:
-        title: For messages, for example "the left arm".
+        title: Title in messages, for example "the left arm".
         config: Parameters.
         names: The joints.
         lower: (n,) joint limits, infinite for a joint that turns without end.
@@ -159,8 +159,8 @@ class PlanningGroup(ABC):
         Joints that turn without end go the short way, and the other way only where the search finds no path.
 
         Args:
-            scene: What it keeps clear of.
-            now: Where it starts.
+            scene: Planning scene to keep clear of.
+            now: State at the start.
             goals: (k, n) rad, joints that turn without end in any turn.
             time_limit: s.
             validate: Raises `PlanFailedError` for a trajectory in a scene; None is `validate_trajectory`.
@@ -247,7 +247,7 @@ class Arm(PlanningGroup):
     """One arm.
 
     Args:
-        name: For messages, for example "left".
+        name: Name in messages, for example "left".
         description: The robot.
         config: Parameters.
         static: Boxes that are always there (the table), base frame; held objects may rest on them.
@@ -368,7 +368,7 @@ class Arm(PlanningGroup):
             straight: Clearance of straight parts instead of free paths.
             gripper: Distance of the finger pads from the middle instead of the present one, m.
             environment: Bodies of the planning scene, as certain as the table, the map, and the distance of the arms.
-            carried: What goes with the other arm, see `CollisionContext`.
+            carried: Boxes that go with the other arm, see `CollisionContext`.
             arms: Distance that the arms keep from each other instead of that of clearance and environment, m.
             clearance: Instead of that of free paths.
         """
@@ -403,7 +403,7 @@ class Arm(PlanningGroup):
         """Let the arm leave its start: where it overlaps an estimated box, the box is wrong, not the arm.
 
         Args:
-            scene: Where it starts.
+            scene: Planning scene at the start.
             start: (n,) rad.
 
         Raises:

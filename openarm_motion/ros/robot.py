@@ -49,7 +49,7 @@ class NodeRobot:
     Args:
         node: Owns clients, timer, executor and threads.
         config: Parameters.
-        holds: Which client each arm serves.
+        holds: Client that each arm serves.
     """
 
     def __init__(self, node: BaseNode[Any], config: MotionConfig, holds: HoldListener) -> None:

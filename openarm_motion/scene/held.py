@@ -44,7 +44,7 @@ class HeldObjects:
 
         Args:
             arm: The arm.
-            attached: What the request says it holds; nothing said is what it is known to hold.
+            attached: Boxes that the request says it holds; nothing said is what it is known to hold.
             hand_empty: The request says that it holds nothing.
 
         Raises:

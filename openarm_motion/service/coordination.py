@@ -33,8 +33,8 @@ class ArmCoordination:
 
     Args:
         robot: The robot.
-        arms: By name.
-        held: What the hands hold.
+        arms: Arms by name.
+        held: Boxes that the hands hold.
         on_held: Called when what a hand holds has changed.
     """
 

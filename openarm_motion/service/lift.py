@@ -31,9 +31,9 @@ class LiftMotions:
 
     Args:
         robot: The robot.
-        arms: On the lift.
-        context: What plans start from.
-        memory: What the hands hold.
+        arms: Arms on the lift.
+        context: Context that plans start from.
+        memory: Memory of what the hands hold.
         claim: Takes arms for as long as it is open.
         stale_after: Age of joint states that counts as lost, s.
     """
@@ -57,9 +57,9 @@ class LiftMotions:
 
         Args:
             goal: (1,) position of the lift, m; of another size when the request asks for something else.
-            request: What is asked.
+            request: Request.
             stopped: Whether to stop.
-            answer: To be filled.
+            answer: Answer to fill.
         """
         begin = self._robot.now()
         try:

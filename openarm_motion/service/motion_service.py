@@ -106,7 +106,7 @@ def make_arms(
         config: Parameters.
         description: The robot.
         fixed: Boxes that are always there (the table), base frame.
-        cameras: By name, at their mounts; None: those of this process's robot, where the configuration says.
+        cameras: Cameras by name, at their mounts; None: those of this process's robot, where the configuration says.
     """
     body = with_housings(description, (load_cameras() if cameras is None else cameras).values())
     names = config.arms or body.arm_names
@@ -123,8 +123,8 @@ class MotionService:
     Args:
         robot: The robot and its clock.
         config: Parameters.
-        arms: From `make_arms`.
-        field: Where the map comes from.
+        arms: Arms from `make_arms`.
+        field: Source of the map.
         frames: Names of the base frame.
     """
 
@@ -163,7 +163,7 @@ class MotionService:
         """Choose and plan one of several approaches of an arm.
 
         Args:
-            request: What is asked.
+            request: Request.
             cancelled: Whether to stop.
             report: Called with the stage and the number of targets checked, also from a worker thread.
         """

@@ -28,7 +28,7 @@ class PolylineTiming:
         how: Corners rounded ("blended"), or with a stop ("stops"), or quintic with a stop.
         names: Joints.
         waypoints: (m, n) rad.
-        limits: What no joint exceeds.
+        limits: Limits that no joint exceeds.
         period: Greatest time between two samples, s.
     """
 
@@ -77,7 +77,7 @@ def time_quintic(names: Sequence[str], waypoints: Array, limits: JointLimits, pe
     Args:
         names: Joints.
         waypoints: (m, n) rad.
-        limits: What no joint exceeds.
+        limits: Limits that no joint exceeds.
         period: Greatest time between two samples, s.
     """
     path = waypoints[distinct(waypoints)]

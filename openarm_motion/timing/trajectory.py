@@ -201,7 +201,7 @@ def polyline_profile(waypoints: Array, limits: JointLimits, caps: Array) -> tupl
 
     Args:
         waypoints: (m, n) rad, each at another place than the one before, m >= 2.
-        limits: What no joint exceeds.
+        limits: Limits that no joint exceeds.
         caps: (m - 2,) share of the greatest speed that is allowed in each corner; 0 is a stop.
 
     Returns:
@@ -242,7 +242,7 @@ def time_polyline(names: Sequence[str], waypoints: Array, limits: JointLimits, p
     Args:
         names: Joints.
         waypoints: (m, n) rad.
-        limits: What no joint exceeds.
+        limits: Limits that no joint exceeds.
         period: Greatest time between two samples, s.
     """
     return time_rounded(names, waypoints, limits, np.zeros(len(waypoints)), period)[0]
@@ -256,7 +256,7 @@ def time_rounded(
     Args:
         names: Joints.
         waypoints: (m, n) rad.
-        limits: What no joint exceeds.
+        limits: Limits that no joint exceeds.
         caps: (m,) share of the greatest speed that is allowed in each way point between the ends; 0 is a stop.
         period: Greatest time between two samples, s.
 
@@ -288,7 +288,7 @@ def time_path(
         names: Joints.
         path: (m, n) rad, smooth and dense, m >= 6.
         s: (m,) way along the path that rises from 0, for example of the tool, m.
-        limits: What no joint exceeds.
+        limits: Limits that no joint exceeds.
         speed: Greatest ds/dt.
         period: Greatest time between two samples, s.
     """
