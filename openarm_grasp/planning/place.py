@@ -183,7 +183,7 @@ def free_spots(
         shoulders: Shoulders of the arms.
         choices: (x, y) of spots, base frame, m; none: a grid on the arm's side.
         seen: (n, 3) points of the table that are in view: spots that nothing hides come first; None: all are.
-        every: All that there are, not only `config.place.spots`.
+        every: All that there are, not only `config.place.spots`; where none keeps its distance, those where it fits.
 
     Raises:
         OpenArmError: PLACE_FAILED, when nothing is free.
@@ -193,6 +193,9 @@ def free_spots(
     spots = choices or [*product(grid(*place.region_x, place.spot_step), ys)]
     reach = 0.5 * float(np.hypot(*target.size[:2]))
     clear = clear_spots(spots, target, others, place)
+    if not clear and every:
+        near = place.model_copy(update={"neighbour_distance": 0.0, "origin_distance": 0.0})
+        clear = clear_spots(spots, target, others, near)
     if not clear:
         what = f"none of {len(choices)} places is free" if choices else f"no free spot for the {arm} arm"
         raise OpenArmError(

@@ -180,7 +180,16 @@ def test_every_free_spot_is_offered_for_what_a_hand_has_kept() -> None:
 
 def test_a_full_table_has_no_free_spot():
     crowd = [box(x=x, y=y, label="blue") for x in np.arange(0.1, 0.5, 0.08) for y in np.arange(-0.5, 0.0, 0.08)]
-    assert refused(None, free_spots, "right", box(), crowd, CONFIG, SHOULDERS).code is Code.PLACE_FAILED
+    for every in (False, True):
+        error = refused(None, free_spots, "right", box(), crowd, CONFIG, SHOULDERS, every=every)
+        assert error.code is Code.PLACE_FAILED
+
+
+def test_what_a_hand_has_kept_is_put_down_next_to_others_where_no_spot_keeps_its_distance() -> None:
+    crowd = [box(x=x, y=y, label="blue") for x in np.arange(0.1, 0.5, 0.14) for y in np.arange(-0.5, 0.0, 0.14)]
+    refused(None, free_spots, "right", box(), crowd, CONFIG, SHOULDERS)
+    spots = np.array(free_spots("right", box(), crowd, CONFIG, SHOULDERS, every=True))
+    assert min(distances_from(one, spots).min() for one in crowd) >= 0.5 * min(box().size[:2])
 
 
 @pytest.mark.requirement("P-19", "P-03")
