@@ -33,8 +33,12 @@ def object_points(clouds: Sequence[LabelledCloud]) -> Array:
 
 
 def first_points(sighting: Sighting) -> Array:
-    """Return the points (n, 3) of the object in the oldest of its images: all are of its first camera."""
-    return object_points(sighting.clouds[:1])
+    """Return the points (n, 3) of the object in the oldest of its images: all are of its first camera.
+
+    Pixels at the edge of a colour show what is behind it: of a prism the points in its box count.
+    """
+    points, target = object_points(sighting.clouds[:1]), sighting.target
+    return points[in_box(points, target)] if target.kind and target.measured else points
 
 
 def points_around(clouds: Sequence[LabelledCloud]) -> Array:

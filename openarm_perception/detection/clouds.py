@@ -36,7 +36,8 @@ def labelled_cloud(
 ) -> LabelledCloud:
     """Return the points of detections and, fewer, of everything else, in the optical frame.
 
-    Pixels of the robot, of what it holds, and those that float between surfaces are left out.
+    Pixels of the robot, of what it holds, and those that float between surfaces are left out. One of several detections
+    is of the smallest: that is in front of the others, or stands on them.
 
     Args:
         view: The image.
@@ -47,7 +48,7 @@ def labelled_cloud(
     """
     label, near = np.zeros(view.depth.shape, np.uint32), np.zeros(view.depth.shape, np.bool_)
     scan = DepthView(view.depth, view.intrinsics, view.T_base_camera, limits.near, limits.far)
-    for i, place in enumerate(boxes, start=1):
+    for i, place in sorted(enumerate(boxes, start=1), key=lambda one: -np.count_nonzero(one[1].source.mask)):
         (u, v), (width, height) = place.source.origin, place.source.size
         label[v : v + height, u : u + width][place.source.mask] = i
         near[_window(place, scan, label.shape)] = True
