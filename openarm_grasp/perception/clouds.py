@@ -73,7 +73,8 @@ def risen_points(frames: Sequence[Frame], sighting: Sighting, rise: float) -> Ar
                 continue
             # of what hangs in a hand an end may be all that is seen; a few points that fly make it no neighbour
             beside = float(np.percentile(place.query(points[:, :2])[0], 2.0))
-            risen = float(np.percentile(points[:, 2], _OF_HAND)) - target.bottom if target.kind else _top(points) - top
+            low = float(np.percentile(points[:, 2], _OF_HAND if frame.cloud.measured else 0.0))
+            risen = low - target.bottom if target.kind else _top(points) - top
             if risen >= rise and beside <= _OVER:
                 found.append(points)
     clouds, points = sighting.clouds[-1:], np.concatenate(found)

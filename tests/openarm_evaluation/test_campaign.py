@@ -190,9 +190,9 @@ def test_of_several_that_were_lifted_the_one_at_the_place_is_judged(tmp_path) ->
         placed = name
     x, y, z = (float(v) for v in run.robot.tracks[placed][0].p_world)
     answer = GraspOutcome(Code.PLACE_FAILED, "", "anything", attempts=2, place_position=(x, y, z))
-    assert run._trial("anything", answer, (), 0.0).target == placed
+    assert run.link.run(run._trial("anything", answer, (), 0.0)).target == placed
     nowhere = replace(answer, place_position=(0.0, 0.0, 0.0))
-    assert run._trial("anything", nowhere, (), 0.0).target != placed
+    assert run.link.run(run._trial("anything", nowhere, (), 0.0)).target != placed
 
 
 @pytest.mark.long
