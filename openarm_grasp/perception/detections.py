@@ -8,10 +8,9 @@ the same box.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +32,8 @@ NEXT_TO = 0.03
 #: Where the middle of an object is that is not asked for, what has its middle there, or has that in its box, or nearly,
 #: is it or a part of it, m.
 _PART = 0.01
+#: What has its middle this near to a point of something is a piece of that, m.
+_ON = 0.015
 #: Clouds of so many frames are enough.
 _CLOUDS = 3
 #: Of an object that has not moved more than this share is seen where it was; of one that has by 5 mm, less.
@@ -194,7 +195,7 @@ def find(
     *,
     at: Sequence[float] | None = None,
     exclude_near: Sequence[Spot] = (),
-    placed: Mapping[Spot, str] = MappingProxyType({}),
+    exclude_parts: Sequence[Array] = (),
     same: Sighting | None = None,
 ) -> Sighting:
     """Choose an object, follow it by its id through all frames, and average it.
@@ -205,7 +206,7 @@ def find(
         limits: Limits of how much an object may seem to move.
         at: (x, y) where it stands, m; None: anywhere.
         exclude_near: (x, y) of objects that are excluded, m.
-        placed: Ids of what was placed at some of these positions: where one is in view, it alone is excluded.
+        exclude_parts: (n, 2) points of others that are excluded, m.
         same: The object as it was seen or left before: it is looked for alone, whatever the words fit now.
 
     Raises:
@@ -215,7 +216,7 @@ def find(
             UNKNOWN_OBJECT, naming what is in view; STALE_DATA, when the object was not in the newest frame and two
             thirds of all, or moved between them.
     """
-    anchor = _same(frames, same) if same else _anchor(in_view(frames, label), label, at, exclude_near, placed)
+    anchor = _same(frames, same) if same else _anchor(in_view(frames, label), label, at, exclude_near, exclude_parts)
     sights = [_Sight(d, _labelled(frame, d)) for frame in frames for d in frame.detections if d.id == anchor.id]
     track, enough = [one for one in sights if one.shown.measured], 2 * len(frames)
     if 3 * len(track) < enough:  # a part of something of unknown shape is taken on its points
@@ -314,14 +315,12 @@ def _anchor(
     label: str,
     at: Sequence[float] | None,
     exclude_near: Sequence[Spot],
-    placed: Mapping[Spot, str],
+    exclude_parts: Sequence[Array],
 ) -> Detection:
     """The detection of the object that is asked for."""
     name = label or "the object"
-    ids = [_whole(d) for d in fitting]
-    known = {spot: name for spot, name in placed.items() if spot in exclude_near and name in ids}
-    stay = _excluded(fitting, [spot for spot in exclude_near if spot not in known])
-    stay |= [name in known.values() for name in ids]
+    stay = _excluded(fitting, exclude_near)
+    stay |= [any(_of_it(d, points) for points in exclude_parts) for d in fitting]
     chosen = [d for d, stays in zip(fitting, stay, strict=True) if not stays]
     if not chosen:
         raise OpenArmError(
@@ -353,6 +352,13 @@ def _excluded(fitting: Sequence[Detection], exclude_near: Sequence[Spot]) -> NDA
     stay[nearest[away.min(axis=0) <= SAME_PLACE]] = True
     in_box = np.array([distances_from(d, positions) <= _PART for d in fitting]) & (away.min(axis=0) > _PART)
     return stay | ((away <= SAME_PLACE / 2.0) | in_box).any(axis=1)
+
+
+def _of_it(d: Detection, points: Array) -> bool:
+    """Whether a detection is a thing of which points (n, 2) are known, has it in its box, or is a piece of it."""
+    return bool(
+        np.linalg.norm(points - d.p_base[:2], axis=1).min() <= _ON or np.median(distances_from(d, points)) <= _PART
+    )
 
 
 def _not_measured(d: Detection) -> UntrustedError:

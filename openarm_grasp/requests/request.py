@@ -6,12 +6,13 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import LONGEST_TEXT, brief, check_length
+from openarm_common.types import Array
 from openarm_grasp.config import LEAST_SCALE, DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict
 from openarm_grasp.perception.detections import Frame, Sighting, Spot, find
@@ -44,7 +45,7 @@ class GraspRequest:
         velocity_scale: Share of the limits of the joints, 0.001 to 1; 0: that of the configuration.
         object_at: (x, y) near which the object is, base frame, m; None: any that is called so.
         exclude_near: (x, y) of objects that stay where they are, base frame, m.
-        placed: Ids of what was placed at some of these positions.
+        exclude_parts: (n, 2) points of others that do, base frame, m.
         place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
         why: Purpose, when it is a part of another request.
         same: The object, when an earlier part of the request was about it: as it was seen or left then.
@@ -62,7 +63,7 @@ class GraspRequest:
     velocity_scale: float = 0.0
     object_at: tuple[float, ...] | None = None
     exclude_near: tuple[Spot, ...] = ()
-    placed: Mapping[Spot, str] = field(default_factory=dict[Spot, str])
+    exclude_parts: tuple[Array, ...] = ()
     place_choices: tuple[Spot, ...] = ()
     why: str = ""
     same: Sighting | None = None
@@ -96,7 +97,7 @@ class GraspRequest:
             limits,
             at=self.object_at,
             exclude_near=self.exclude_near,
-            placed=self.placed,
+            exclude_parts=self.exclude_parts,
             same=self.same,
         )
 

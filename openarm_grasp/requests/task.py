@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from openarm_common import se3
 from openarm_common.detection import Detection
@@ -18,6 +20,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.drift import DriftWatch
 from openarm_grasp.evidence.verdicts import Evidence, HandVerdict, Verdict, judge_grip
 from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.perception.sightings import object_points
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import SAME_SPOT
@@ -30,8 +33,8 @@ if TYPE_CHECKING:
     from openarm_grasp.robot.skills import Skills
     from openarm_grasp.strategies.run import Run
 
-#: Objects whose places are remembered.
-_REMEMBERED = 50
+#: Objects whose places are remembered, and the edge of a cell of their points, m.
+_REMEMBERED, _CELL = 50, 0.01
 
 
 # --- what outlives a request
@@ -98,19 +101,19 @@ class Placed:
     failure: Verdict | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Stand:
     """An object that was placed.
 
     Attributes:
         spot: (x, y), base frame, m.
-        id: Id of the object.
+        points: (n, 2) where its points are, as far as known, m.
         began_ns: Robot time at which the request began that has placed it.
         ended_ns: Robot time at which it stood there.
     """
 
     spot: Spot
-    id: str
+    points: Array
     began_ns: int
     ended_ns: int
 
@@ -133,24 +136,29 @@ class GraspSession:
         #: The newest objects that were placed.
         self._placed: list[_Stand] = []
 
-    def stay(self, spots: Sequence[Spot]) -> Mapping[Spot, str]:
-        """Return positions of what must stay, with the ids of what was placed there, "" where that is not known.
+    def parts_of(self, stay: Sequence[Spot]) -> tuple[tuple[Spot, ...], tuple[Array, ...]]:
+        """Return positions at which nothing known was placed, and points (n, 2) of what was placed at others, m.
 
         Who names what a request has placed may not have heard yet of what was placed since that began: it stays, too.
         """
-        named = [one.began_ns for one in self._placed if any(math.dist(one.spot, spot) < SAME_SPOT for spot in spots)]
+        named = [one.began_ns for one in self._placed if any(math.dist(one.spot, spot) < SAME_SPOT for spot in stay)]
         since = (one.spot for one in self._placed if named and one.ended_ns >= named[-1])
-        found = dict.fromkeys((*spots, *since), "")
-        return found | {spot: one.id for one in self._placed for spot in found if math.dist(one.spot, spot) < SAME_SPOT}
+        spots = dict.fromkeys((*stay, *since))
+        known = {spot: one.points for one in self._placed for spot in spots if math.dist(one.spot, spot) < SAME_SPOT}
+        known = {spot: points for spot, points in known.items() if len(points)}
+        return tuple(spot for spot in spots if spot not in known), tuple(known.values())
 
     def end(self, run: Run, outcome: GraspOutcome) -> None:
         """End a request; what it has placed is remembered, and no other takes it that runs."""
         self.runs.remove(run)
         if outcome.success and run.tried and not outcome.held:
             x, y, _ = outcome.place_position
-            name = run.grasp.sighting.target.id if run.grasp else ""
+            points = np.empty((0, 3))
+            if run.grasp is not None and run.place_target is not None:
+                points = se3.apply(run.grasp.motion_to(run.place_target), object_points(run.grasp.sighting.clouds))
+            cells = np.unique(np.round(points[:, :2] / _CELL), axis=0) * _CELL
             kept = [one for one in self._placed if math.dist(one.spot, (x, y)) >= SAME_SPOT]
-            self._placed = [*kept[1 - _REMEMBERED :], _Stand((x, y), name, run.began_ns, run.robot.now_ns)]
+            self._placed = [*kept[1 - _REMEMBERED :], _Stand((x, y), cells, run.began_ns, run.robot.now_ns)]
             for other in self.runs:
                 other.request = other.request.without((x, y))
 

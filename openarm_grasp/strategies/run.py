@@ -34,8 +34,8 @@ class Run:
 
     def __init__(self, task: Task, request: GraspRequest, kept: Grasp | None) -> None:
         self.task, self.kept = task, kept
-        stay = task.session.stay(request.exclude_near)
-        self.request = replace(request, exclude_near=tuple(stay), placed=stay)
+        near, parts = task.session.parts_of(request.exclude_near)
+        self.request = replace(request, exclude_near=near, exclude_parts=(*request.exclude_parts, *parts))
         self.robot, self.context, self.config = task.robot, task.context, task.context.config
         self.began_ns = task.robot.now_ns
         self.state = State.IDLE

@@ -66,14 +66,16 @@ def test_what_the_border_cuts_is_placed_when_all_of_it_is_seen_there(recorded: R
     assert "mm from where it was put down" in outcome.message
 
 
-def test_what_was_placed_is_known_by_its_id_and_not_picked_again(recorded: Recordings) -> None:
+def test_where_the_points_of_what_was_placed_are_is_remembered(recorded: Recordings) -> None:
     robot = recorded(alone("banana", 0.27, -0.22, 0.4))
-    x, y, _ = robot.succeeds("anything").place_position
-    assert robot.session.stay(((x, y),))[x, y]
-    assert not robot.session.stay(((x + 0.05, y),))[x + 0.05, y]
-    again = robot.ask("anything", exclude_near=((x, y),))
-    assert again.code is Code.UNKNOWN_OBJECT
-    assert "besides 1 that must stay" in again.message
+    place = tuple(robot.succeeds("anything").place_position[:2])
+    near, (points,) = robot.session.parts_of((place,))
+    assert near == ()
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    assert np.linalg.norm(middle - place) < 0.03
+    assert 0.10 < np.linalg.norm(np.ptp(points, axis=0)) < 0.25
+    elsewhere = (place[0] + 0.05, place[1])
+    assert robot.session.parts_of((elsewhere,)) == ((elsewhere,), ())
 
 
 def kept_banana(recorded: Recordings) -> tuple[Requests, str, Grasp]:

@@ -185,19 +185,22 @@ def test_what_lies_around_something_that_must_stay_is_picked() -> None:
     refused("besides 1 that must stay", look, frames((around,)), exclude_near=((0.30, -0.18),))
 
 
-def test_a_piece_of_what_was_placed_is_not_picked_however_far_from_its_middle() -> None:
-    end = replace(seen(x=0.30, y=-0.08, size=(0.02, 0.05, 0.01)), id="7.2")
-    neighbour = replace(seen(x=0.34, y=-0.08, size=(0.02, 0.05, 0.01), score=0.8), id="9")
-    spot = (0.30, -0.155)
-    assert look(frames((end, neighbour)), exclude_near=(spot,)).target.id == "7.2"
-    assert look(frames((end, neighbour)), exclude_near=(spot,), placed={spot: "7"}).target.id == "9"
-    assert look(frames((end, neighbour)), placed={spot: "7"}).target.id == "7.2"  # nobody excludes it
+def test_a_piece_of_what_must_stay_is_not_picked_however_far_from_its_middle() -> None:
+    end = seen(x=0.30, y=-0.08, size=(0.02, 0.05, 0.01))
+    neighbour = seen(x=0.34, y=-0.08, size=(0.02, 0.05, 0.01), score=0.8)
+    whole = np.column_stack([np.full(20, 0.30), np.linspace(-0.25, -0.06, 20)])
+    stay = ((0.30, -0.155),)
+    assert look(frames((end, neighbour)), exclude_near=stay).target.p_base[0] == pytest.approx(0.30)
+    found = look(frames((end, neighbour)), exclude_parts=(whole,))
+    assert found.target.p_base[0] == pytest.approx(0.34)
 
 
-def test_what_lies_where_something_was_placed_that_is_elsewhere_now_is_picked() -> None:
-    came, moved, spot = replace(seen(x=0.30), id="4"), replace(seen(x=0.40), id="7"), (0.30, -0.2)
-    assert look(frames((came, moved)), exclude_near=(spot,), placed={spot: "7"}).target.id == "4"
-    refused("besides 1 that must stay", look, frames((came,)), exclude_near=(spot,), placed={spot: "7"})  # 7 was lost
+def test_what_lies_where_something_stayed_that_is_not_there_any_more_is_picked() -> None:
+    egg = np.stack(np.meshgrid(np.linspace(0.28, 0.32, 5), np.linspace(-0.22, -0.18, 5)), axis=-1).reshape(-1, 2)
+    beside = seen(x=0.27, y=-0.24, yaw=0.3, size=(0.03, 0.12, 0.05))
+    assert look(frames((beside,)), exclude_parts=(egg,)).target.p_base[0] == pytest.approx(0.27)
+    for there in (seen(x=0.30, size=(0.05, 0.05, 0.05)), seen(x=0.28, y=-0.24, size=(0.10, 0.16, 0.05))):  # or its heap
+        refused("besides 1 that must stay", look, frames((there,)), exclude_parts=(egg,))
 
 
 def test_what_stands_close_to_what_must_stay_is_picked() -> None:
