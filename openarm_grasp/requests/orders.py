@@ -258,7 +258,7 @@ class Order:
         return arm == _ANY_ARM and bool(self._able) and all((label, one) in self._asked for one in self._able)
 
     def _easiest(self, label: str, arm: str) -> GraspRequest:
-        """A request for any object of a label; whatever it was asked for as, what was placed or left is not meant.
+        """A request for any object of a label; whatever it was asked for as, what was placed or left is excluded.
 
         What an arm reached, but could not take, may have come free when anything has been moved since.
         """

@@ -162,7 +162,7 @@ class GraspSession:
             for other in self.runs:
                 other.request = other.request.without((x, y))
 
-    def beside(self, run: Run, request: GraspRequest) -> GraspRequest:
+    def excluding_others(self, run: Run, request: GraspRequest) -> GraspRequest:
         """Return a request for what no other request is at: neither where it takes it nor where it puts it."""
         ends = [
             spot for r in self.runs if r is not run for spot in (r.seen_at, r.place_target and r.place_target.position)

@@ -190,7 +190,7 @@ def _beside_others(run: Run) -> GraspRequest:
 
     For the easiest an arm by name takes the outermost easy one on its side: the arms come together last.
     """
-    request, shoulders = run.task.session.beside(run, run.request), run.context.shoulders
+    request, shoulders = run.task.session.excluding_others(run, run.request), run.context.shoulders
     side = sides(request.arm, shoulders) if request.arm in shoulders else ()
     if len(side) != 1 or not request.label.startswith(EASIEST):
         return request
