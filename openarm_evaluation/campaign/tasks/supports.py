@@ -36,13 +36,15 @@ _ASIDE = 0.30
 _HAND = 0.08
 #: Grasps of an object that are looked at, best first.
 _GRASPS = 4
+#: Scenes that are drawn until one fits: of those with two boxes one in some hundreds does.
+_DRAWS = 100_000
 
 
 def supports_task(seed: int) -> Task:
     """Make a task with an object, the supports that it comes from and goes to, and another object on the table."""
     rng, kind = np.random.default_rng([seed, 47]), KINDS[seed % len(KINDS)]
     what = f"supports {seed}: things side by side that an arm reaches where they stand and where they go"
-    scene, (x, y, _) = first_fit(what, "enlarge work.region of robot.yaml", lambda: _drawn(rng, seed, kind), 4000)
+    scene, (x, y, _) = first_fit(what, "enlarge work.region of robot.yaml", lambda: _drawn(rng, seed, kind), _DRAWS)
     labels = (scene.objects[0].label,)
     if kind.startswith("from"):
         return Task("supports", seed, scene, labels, kind=kind, place=(x, y))
