@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from openarm_common.camera.cameras import spectator_camera
-from openarm_common.figures import render_page
+from openarm_common.figures import data_uri, render_figure, render_page
 from openarm_evaluation.judging.statistics import interval, rate_of, spread
 
 Row = Mapping[str, Any]
@@ -214,15 +214,20 @@ def write_html(path: Path, data: Mapping[str, Any]) -> None:
         summary=data["summary"],
         figures=figures(data),
         rate=_rate,
-        lines=_time_lines(data["rows"][:_LINES]),
-        colors=_COLORS,
+        lines=data_uri(time_lines(data["rows"][:_LINES]), "image/svg+xml"),
         failures=[(row, pictures) for row, pictures in failures if pictures and not row["as_expected"]],
     )
     path.write_text(page, encoding="utf-8")
 
 
-def _time_lines(rows: Sequence[Row]) -> list[tuple[str, list[tuple[str, float, float, str]]]]:
-    """Lines of time by scene and arm, all to one scale: state, begin and length in %, and what to show of each."""
+def time_lines(rows: Sequence[Row]) -> bytes:
+    """Return a picture (SVG) of what each arm did when, a line for each scene and arm; gaps are waiting.
+
+    Args:
+        rows: Rows of scenes.
+    """
+    from matplotlib.figure import Figure
+
     lines: dict[str, list[tuple[str, float, float]]] = defaultdict(list)
     for row in rows:
         first = min((grasp.get("began_s", 0.0) for grasp in row["grasps"]), default=0.0)
@@ -231,12 +236,17 @@ def _time_lines(rows: Sequence[Row]) -> list[tuple[str, list[tuple[str, float, f
             for step in grasp.get("states", ()):
                 lines[f"{row['seed']} {grasp['arm']}"].append((step["state"], at, float(step["seconds"])))
                 at += float(step["seconds"])
-    longest = max((at + s for line in lines.values() for _, at, s in line), default=0.0) or 1.0
-    share = 100.0 / longest
-    return [
-        (name, [(state, share * at, share * s, f"{state} {s:.2f} s from {at:.2f} s") for state, at, s in line])
-        for name, line in lines.items()
-    ]
+    axes = Figure(figsize=(9.0, 1.2 + 0.25 * len(lines))).add_subplot()
+    for state, color in _COLORS.items():
+        for height, line in enumerate(lines.values()):
+            spans = [(at, seconds) for name, at, seconds in line if name == state]
+            axes.broken_barh(spans, (height - 0.4, 0.8), color=color, label="" if height else state)
+    axes.set_yticks(range(len(lines)), lines)
+    axes.invert_yaxis()
+    axes.set_xlabel("robot time, s")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5, frameon=False, fontsize="small")
+    return render_figure(axes, "svg", margin=4.0)
 
 
 def _pictures(campaign: Path, folder: str) -> list[str]:

@@ -171,9 +171,10 @@ def free_spots(
 ) -> tuple[Array, ...]:
     """Free spots, best first: of those that may be chosen, or anywhere on the arm's side of the table.
 
-    A spot keeps its distance from every other object and from where the object came. Those come first where it fits in
-    whatever its turn, then those that leave room for a hand around the others; among them, room around it counts (up to
-    twice the distance asked for) and nearness to where it came from, which keeps the carry short.
+    A spot keeps its distance from every other object and from where the object came; where none does, it is one where
+    the object fits. Those come first where it fits in whatever its turn, then those that leave room for a hand around
+    the others; among them, room around it counts (up to twice the distance asked for) and nearness to where it came
+    from, which keeps the carry short.
 
     Args:
         arm: Arm whose side.
@@ -183,25 +184,25 @@ def free_spots(
         shoulders: Shoulders of the arms.
         choices: (x, y) of spots, base frame, m; none: a grid on the arm's side.
         seen: (n, 3) points of the table that are in view: spots that nothing hides come first; None: all are.
-        every: All that there are, not only `config.place.spots`; where none keeps its distance, those where it fits.
+        every: All that there are, not only `config.place.spots`; where it came from is one when nothing else is free.
 
     Raises:
-        OpenArmError: PLACE_FAILED, when nothing is free.
+        OpenArmError: PLACE_FAILED, when it fits nowhere.
     """
     place = config.place
     ys = np.concatenate([grid(*place.region_abs_y, place.spot_step) * side for side in sides(arm, shoulders)])
     spots = choices or [*product(grid(*place.region_x, place.spot_step), ys)]
     reach = 0.5 * float(np.hypot(*target.size[:2]))
     clear = clear_spots(spots, target, others, place)
-    if not clear and every:
-        near = place.model_copy(update={"neighbour_distance": 0.0, "origin_distance": 0.0})
-        clear = clear_spots(spots, target, others, near)
+    if not clear:
+        fitting = {"neighbour_distance": 0.0, **({"origin_distance": 0.0} if every else {})}
+        clear = clear_spots(spots, target, others, place.model_copy(update=fitting))
     if not clear:
         what = f"none of {len(choices)} places is free" if choices else f"no free spot for the {arm} arm"
         raise OpenArmError(
             Code.PLACE_FAILED,
-            f"{what}: none is {place.neighbour_distance * 1e3:.0f} mm from"
-            f" {len(others)} other objects and {place.origin_distance * 1e3:.0f} mm from where it stood",
+            f"{what}: {target.label!r}, {min(target.size[:2]) * 1e3:.0f} mm wide, fits nowhere between"
+            f" {len(others)} other objects",
         )
     xy = np.array([spot[2:] for spot in clear])
     room = np.min([np.full(len(xy), inf), *(distances_from(d, xy) for d in others)], axis=0)
