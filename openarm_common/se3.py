@@ -16,6 +16,9 @@ from numpy.typing import ArrayLike
 
 from openarm_common.types import Array
 
+#: Corners (8, 3) of a box of half edges 1.
+BOX_CORNERS: Array = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+
 
 def make(R: ArrayLike | None = None, p: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """Build a transform.

@@ -26,7 +26,7 @@ from openarm_calibration.handeye.refine import information_at, mount_error
 from openarm_calibration.handeye.robust import SolveConfig, solve_robustly
 from openarm_calibration.handeye.transforms import inverses
 from openarm_calibration.handeye.unknowns import Noise, invert_scaled
-from openarm_calibration.sampling.bodies import Bodies, chain_poses
+from openarm_calibration.sampling.occluders import Occluders
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
@@ -35,6 +35,7 @@ from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import load_folder, robot_name
+from openarm_common.robot.tree import KinematicTree
 from openarm_common.types import Array
 
 #: Marks nearer to the edge of the image do not count as seen, px.
@@ -164,7 +165,7 @@ class PoseSearch:
         self._nominal = nominal
         self._config = config or SearchConfig()
         self._rng = np.random.default_rng(self._config.seed)
-        self._bodies = Bodies(description)
+        self._occluders = Occluders(description)
         self._contact = SelfCollision(description, tuple(description.joints))
         work = load_folder(robot_name())[1].work
         self._table = None if work is None else work.table
@@ -251,14 +252,14 @@ class PoseSearch:
 
         Until one is found they are drawn from the whole range, then around those that are known.
         """
-        config, rng = self._config, self._rng
-        lower, upper = self._description.limits(samples.joint_names, np.pi)
+        config, rng, description = self._config, self._rng, self._description
+        lower, upper = description.limits(samples.joint_names, np.pi)
         low, high = lower + config.joint_margin, upper - config.joint_margin
-        lift = self._description.lift
+        lift = description.lift
         if lift is not None and lift.joint in samples.joint_names:  # it stays where it is
             k = samples.joint_names.index(lift.joint)
             low[k] = high[k] = state[lift.joint]
-        margin = config.margin if self.belief.solved else _RULER
+        margin, tree = config.margin if self.belief.solved else _RULER, KinematicTree(description, samples.joint_names)
         pool, refused, widths = list(self._known), np.array(self._refused), np.array(self._widths)
         wanted = config.candidates if pool else _ENOUGH
         width, height = (edge / 2.0 for edge in samples.board.size)
@@ -278,18 +279,18 @@ class PoseSearch:
             if len(refused):
                 away = np.abs(drawn[:, None] - refused).max(axis=2) / widths
                 drawn = drawn[away.min(axis=1) > 1.0]
-            views = self._views(samples, drawn, Z)
+            views = self._views(samples, tree, drawn, Z)
             for k in np.flatnonzero(self._centred(samples, views)):
                 q, T = drawn[k], views[k]
                 if not visible(samples.board, T, samples.head.optics, margin):
                     continue
                 posture = {**state, **_joints(samples, q)}
-                links = self._description.link_poses(posture)
+                links = description.link_poses(posture)
                 if self._touches(posture) or self._sinks(samples, links, Z, plate):
                     continue
-                shapes = self._bodies.place(links)
+                shapes = self._occluders.place(links)
                 eye = links[samples.head.parent] @ self.belief.X
-                if self._bodies.hidden(shapes, eye[:3, 3], se3.apply(eye @ T, plate)):
+                if self._occluders.hidden(shapes, eye[:3, 3], se3.apply(eye @ T, plate)):
                     shadowed += 1
                     continue
                 out.append((q, T))
@@ -311,11 +312,11 @@ class PoseSearch:
         over = (x > edges[0] - _CLEAR) & (x < edges[1] + _CLEAR) & (y > edges[2] - _CLEAR) & (y < edges[3] + _CLEAR)
         return bool((points[over, 2] < self._table.top_z + _CLEAR).any())
 
-    def _views(self, samples: SampleSet, q: Array, Z: Array) -> Array:
+    def _views(self, samples: SampleSet, tree: KinematicTree, q: Array, Z: Array) -> Array:
         """Return T_camera_board (n, 4, 4) at postures (n, joints)."""
         head = samples.head
         in_hand = head.setup == "in_hand"
-        moving = chain_poses(self._description, head.parent if in_hand else head.carrier, q)
+        moving = tree.link_poses(head.parent if in_hand else head.carrier, q)
         fixed = self._description.link_pose(head.base if in_hand else head.parent, {})
         A = se3.inverse(fixed) @ moving
         return se3.inverse(self.belief.X) @ (inverses(A) if in_hand else A) @ Z

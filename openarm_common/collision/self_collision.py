@@ -1,30 +1,159 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a posture lets a robot touch itself: the shapes of the planner, all links, in some 0.1 ms. m, rad."""
+"""How near links of a robot are to each other in a posture, by the shapes of the planner, in some 0.1 ms. m, rad."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.collision.body_kernels import place_bodies, put_shape
 from openarm_common.collision.hull_kernels import hull_separation
-from openarm_common.collision.hulls import Hull, joined_corners
-from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE, separation
+from openarm_common.collision.hulls import joined_corners
+from openarm_common.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE, put_shape, separation
 from openarm_common.kernels import kernel
-from openarm_common.robot.bodies import Bodies
-from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.urdf import Joint, Primitive
-from openarm_common.types import Array, Ints
+from openarm_common.robot.description import Primitive, RobotDescription
+from openarm_common.robot.tree import KinematicTree, TreeArrays
+from openarm_common.robot.tree_kernels import place_bodies, unplaced
+from openarm_common.types import Array, Ints, Mask
 
-#: Distances are searched up to this one, m.
-_FAR = 0.02
-#: Random states in which links that always touch must do so, as in the planner.
-_SAMPLES = 1000
+#: Two links, by name.
+Pair = frozenset[str]
+#: Distances of links that must not touch are searched up to this one, m; of links that may, up to what is a contact.
+_FAR, _BEYOND = 0.02, 1e-6
+#: States in which links must touch that always do.
+_ALWAYS = 1000
+_FREE: Mapping[str, float] = MappingProxyType({})
+
+
+class LinkDistances:
+    """Shapes of a robot, and pairs of them on different rigid bodies. Not for two threads at once.
+
+    Args:
+        description: The robot; collision meshes are hulls, see `RobotDescription.from_files`.
+        tree: Its links and joints; it says the order of the joints of postures.
+        far: Distances are searched up to this one, m.
+        checked: Whether the shapes of two links make pairs.
+
+    Attributes:
+        pairs: (p, 2) shapes.
+        owners: Link of each shape.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        tree: KinematicTree,
+        far: float,
+        checked: Callable[[str, str], bool] = lambda first, second: True,
+    ) -> None:
+        self._tree, self._far = tree, far
+        found = [(name, shape) for name, link in description.links.items() for shape in link.collision]
+        self.owners = [name for name, _ in found]
+        packed = [_packed(shape) for _, shape in found]
+        kinds, sizes, poses = zip(*packed, strict=True) if packed else ((), (), ())
+        hulls = [shape.hull for _, shape in found]
+        none = np.empty((0, 3))
+        radii = [
+            shape_radius(kind, size, hull.corners if hull else none)
+            for kind, size, hull in zip(kinds, sizes, hulls, strict=True)
+        ]
+        bodies = np.array([tree.body[name] for name in self.owners], np.int64)
+        placed = [tree.fixed[name] @ T for name, T in zip(self.owners, poses, strict=True)]
+        self._shapes = (
+            np.array(kinds, np.int64),
+            np.array(sizes).reshape(-1, 3),
+            *joined_corners(hulls),
+            np.array(radii),
+            bodies,
+            np.array(placed).reshape(-1, 4, 4)[:, :3].copy(),
+        )
+        self._frames = unplaced(len(tree.joints))
+        self._world = self._shapes[-1].copy()
+        self._done = np.zeros(len(found) + 1, np.int64)
+        self._room = np.empty((12, 3))
+        pairs = ((i, j) for i in range(len(found)) for j in range(i) if bodies[i] != bodies[j])
+        pairs = [(i, j) for i, j in pairs if checked(self.owners[i], self.owners[j])]
+        self.pairs: Ints = np.array(pairs, np.int64).reshape(-1, 2)
+
+    def distances_of(self, q: Array, pairs: Ints) -> Array:
+        """Return the distances (k,) of some of the pairs (k, 2) in a posture (n,), at most `far`."""
+        out, state = np.empty(len(pairs)), self._tree.positions(q)
+        rooms = (self._frames, self._world, self._done, self._room)
+        _measure(state, self._tree.arrays, self._shapes, pairs, self._far, *rooms, out)
+        return out
+
+
+class LinkContacts(LinkDistances):
+    """Pairs of links that can move to each other, and whether they touch. Not for two threads at once.
+
+    Args:
+        description: The robot; collision meshes are hulls, see `RobotDescription.from_files`.
+        margin: Links that are nearer to each other touch, m.
+        every: Whether links that may touch make pairs, too.
+    """
+
+    def __init__(self, description: RobotDescription, margin: float = 0.0, *, every: bool = True) -> None:
+        leaders = [joint for joint in description.joints.values() if joint.type != "fixed" and joint.mimic is None]
+        self._names = [joint.name for joint in leaders]
+        tree = KinematicTree(description, self._names)
+        super().__init__(description, tree, margin + _BEYOND, lambda a, b: every or tree.checked(a, b))
+        self._low = np.array([max(joint.lower, -math.pi) for joint in leaders])
+        self._high = np.array([min(joint.upper, math.pi) for joint in leaders])
+        self._margin = margin
+        named = [frozenset((self.owners[i], self.owners[j])) for i, j in self.pairs.tolist()]
+        self._links = list(dict.fromkeys(named))
+        number = {pair: k for k, pair in enumerate(self._links)}
+        #: Pair of links that each pair of shapes is of.
+        self._of = np.array([number[pair] for pair in named], np.int64)
+
+    def touching(self, samples: int, seed: int) -> set[Pair]:
+        """Return the pairs of links that touch in at least one random state."""
+        left, rng = np.ones(len(self._links), np.bool_), np.random.default_rng(seed)
+        for _ in range(samples):
+            left &= ~self._hits(rng.uniform(self._low, self._high), left)
+        return self._named(~left)
+
+    def always_touching(self, share: float = 1.0, held: Mapping[str, float] = _FREE) -> set[Pair]:
+        """Return the pairs of links that touch in every random state.
+
+        Args:
+            share: Share of the states in which they touch, at least.
+            held: Positions of joints that stay there.
+        """
+        misses, rng = np.full(len(self._links), round((1.0 - share) * _ALWAYS)), np.random.default_rng(0)
+        for _ in range(_ALWAYS):
+            if not (misses >= 0).any():
+                break
+            drawn = zip(self._names, rng.uniform(self._low, self._high).tolist(), strict=True)
+            misses -= ~self._hits(self._posture({**dict(drawn), **held}), misses >= 0)
+        return self._named(misses >= 0)
+
+    def at(self, state: Mapping[str, float]) -> set[Pair]:
+        """Return the pairs of links that touch in a state; joints that it does not name are at 0, followers follow."""
+        return self._named(self._hits(self._posture(state), np.ones(len(self._links), np.bool_)))
+
+    def _posture(self, state: Mapping[str, float]) -> Array:
+        return np.array([state.get(name, 0.0) for name in self._names])
+
+    def _hits(self, q: Array, among: Mask) -> Mask:
+        """Return which pairs of links touch in a posture (n,); only some are looked at."""
+        rows, out = np.flatnonzero(among[self._of]), np.zeros(len(self._links), np.bool_)
+        out[self._of[rows[self.distances_of(q, self.pairs[rows]) <= self._margin]]] = True
+        return out
+
+    def _named(self, chosen: Mask) -> set[Pair]:
+        return {self._links[k] for k in np.flatnonzero(chosen)}
+
+
+@lru_cache(maxsize=8)
+def always_touching(description: RobotDescription) -> frozenset[Pair]:
+    """Return the pairs of links that must not touch and do in every random state: that is how they are drawn."""
+    return frozenset(LinkContacts(description, every=False).always_touching())
 
 
 @dataclass(frozen=True)
@@ -36,7 +165,7 @@ class Nearest:
     distance: float
 
 
-class SelfCollision:
+class SelfCollision(LinkDistances):
     """Checks postures of a robot. Not for two threads at once.
 
     Args:
@@ -45,56 +174,22 @@ class SelfCollision:
     """
 
     def __init__(self, description: RobotDescription, joint_names: Sequence[str]) -> None:
-        joints = _in_order(description)
-        body = {description.root: 0} | {joint.child: i + 1 for i, joint in enumerate(joints)}
-        self._share, self._offset = _followed(joints, joint_names)
-        at = Bodies.of(description)
-        fixed = {link: _from_body(description, link) for link in description.links}
-        found = [(name, shape) for name, link in description.links.items() for shape in link.collision]
-        self._links = [name for name, _ in found]
-        packed = [_packed(shape) for _, shape in found]
-        kinds, sizes, hulls, poses = zip(*packed, strict=True) if packed else ((), (), (), ())
-        self._tree = (
-            np.array([body[at.body[joint.parent]] for joint in joints], np.int64),
-            np.array([fixed[joint.parent] @ joint.T_parent_joint for joint in joints]).reshape(-1, 4, 4),
-            np.array([joint.axis / np.linalg.norm(joint.axis) for joint in joints]).reshape(-1, 3),
-            np.array([joint.type == "prismatic" for joint in joints], np.bool_),
-        )
-        none = np.empty((0, 3))
-        radii = [shape_radius(kind, size, hull.corners if hull else none) for kind, size, hull, _ in packed]
-        bodies = np.array([body[at.body[name]] for name in self._links], np.int64)
-        placed = [fixed[name] @ T for name, T in zip(self._links, poses, strict=True)]
-        self._shapes = (
-            np.array(kinds, np.int64),
-            np.array(sizes).reshape(-1, 3),
-            *joined_corners(hulls),
-            np.array(radii),
-            bodies,
-            np.array(placed).reshape(-1, 4, 4)[:, :3].copy(),
-        )
-        self._frames = np.zeros((len(joints) + 1, 3, 4))
-        self._frames[0, :3, :3] = np.eye(3)
-        self._world = self._shapes[-1].copy()
-        self._done = np.zeros(len(found) + 1, np.int64)
-        self._room = np.empty((12, 3))
-        n = len(found)
-        pairs = [(i, j) for i in range(n) for j in range(i) if at.checked(self._links[i], self._links[j])]
-        self._pairs: Ints = np.array(pairs, np.int64).reshape(-1, 2)
-        self._pairs = self._pairs[~self._always(joints)]
+        tree, always = KinematicTree(description, joint_names), always_touching(description)
+
+        def checked(first: str, second: str) -> bool:
+            return tree.checked(first, second) and frozenset((first, second)) not in always
+
+        super().__init__(description, tree, _FAR, checked)
 
     def distances(self, q: Array) -> Array:
         """Return the distances (p,) of the pairs of shapes that must not touch, at most `_FAR`, in a posture (n,)."""
-        return self.distances_of(q, self._pairs)
-
-    def distances_of(self, q: Array, pairs: Ints) -> Array:
-        """Return the same of some of `pairs_of_links`, (k, 2)."""
-        return self._distances(self._share @ q + self._offset, pairs)
+        return self.distances_of(q, self.pairs)
 
     def pairs_of_links(self) -> dict[tuple[str, str], Ints]:
         """Return the pairs of shapes (k, 2) that must not touch, by the links that they belong to."""
         found = dict[tuple[str, str], list[Ints]]()
-        for pair in self._pairs:
-            found.setdefault((self._links[pair[0]], self._links[pair[1]]), []).append(pair)
+        for pair in self.pairs:
+            found.setdefault((self.owners[pair[0]], self.owners[pair[1]]), []).append(pair)
         return {links: np.array(pairs) for links, pairs in found.items()}
 
     def nearest(self, distances: Array) -> Nearest:
@@ -102,25 +197,8 @@ class SelfCollision:
         if not len(distances):
             return Nearest("", "", _FAR)
         k = int(np.argmin(distances))
-        first, second = (self._links[i] for i in self._pairs[k])
+        first, second = (self.owners[i] for i in self.pairs[k])
         return Nearest(first, second, float(distances[k]))
-
-    def _distances(self, full: Array, pairs: Ints) -> Array:
-        out = np.empty(len(pairs))
-        _measure(full, self._tree, self._shapes, pairs, self._frames, self._world, self._done, self._room, out)
-        return out
-
-    def _always(self, joints: Sequence[Joint]) -> NDArray[np.bool_]:
-        """Return which pairs touch in every sample: that is how the shapes are drawn."""
-        touching = np.ones(len(self._pairs), np.bool_)
-        low = np.array([max(joint.lower, -math.pi) for joint in joints])
-        high = np.array([min(joint.upper, math.pi) for joint in joints])
-        rng = np.random.default_rng(0)
-        for _ in range(_SAMPLES):
-            if not touching.any():
-                break
-            touching[touching] = self._distances(rng.uniform(low, high), self._pairs[touching]) <= 0.0
-        return touching
 
 
 def shape_radius(kind: int, size: Array, corners: Array) -> float:
@@ -138,53 +216,25 @@ def shape_radius(kind: int, size: Array, corners: Array) -> float:
     return float(np.linalg.norm(size)) if kind == BOX else float(size[0])
 
 
-def _packed(shape: Primitive) -> tuple[int, Array, Hull | None, Array]:
-    """Return kind, sizes (3,), hull and pose in its link (4, 4) of a shape as the kernels take it."""
+def _packed(shape: Primitive) -> tuple[int, Array, Array]:
+    """Return kind, sizes (3,) and pose in its link (4, 4) of a shape as the kernels take it."""
     T = shape.T_link_primitive
-    if shape.corners is not None:
-        hull = Hull.of(shape.corners)
-        return HULL, hull.half, hull, T @ se3.make(None, hull.centre)
+    if shape.hull is not None:
+        return HULL, shape.hull.half, T @ se3.make(None, shape.hull.centre)
     if shape.kind == "box":
-        return BOX, 0.5 * np.array(shape.size), None, T
+        return BOX, shape.half, T
     if shape.kind == "cylinder":
-        return CYLINDER, np.array([shape.size[0], 0.5 * shape.size[1], 0.0]), None, T
-    return SPHERE, np.array([shape.size[0], 0.0, 0.0]), None, T
-
-
-def _in_order(description: RobotDescription) -> list[Joint]:
-    """Return the movable joints, each after those that carry it."""
-    found = dict[str, Joint]()
-    for link in description.links:
-        found |= {joint.name: joint for joint in description.chain(link) if joint.type != "fixed"}
-    return list(found.values())
-
-
-def _followed(joints: Sequence[Joint], names: Sequence[str]) -> tuple[Array, Array]:
-    """Return A (m, n) and b (m,): positions of all joints are A q + b."""
-    column = {name: k for k, name in enumerate(names)}
-    share, offset = np.zeros((len(joints), len(names))), np.zeros(len(joints))
-    for i, joint in enumerate(joints):
-        leader = joint.mimic or joint.name
-        if leader in column:
-            share[i, column[leader]] = 1.0 if joint.mimic is None else joint.multiplier
-        offset[i] = 0.0 if joint.mimic is None else joint.offset
-    return share, offset
-
-
-def _from_body(description: RobotDescription, link: str) -> Array:
-    """Return the pose (4, 4) of a link in the first link of its rigid body."""
-    T = np.eye(4)
-    for joint in description.chain(link):
-        T = T @ joint.T_parent_joint if joint.type == "fixed" else np.eye(4)
-    return T
+        return CYLINDER, np.array([shape.size[0], 0.5 * shape.size[1], 0.0]), T
+    return SPHERE, np.array([shape.size[0], 0.0, 0.0]), T
 
 
 @kernel
 def _measure(
     q: Array,
-    tree: tuple[Ints, Array, Array, NDArray[np.bool_]],
+    tree: TreeArrays,
     shapes: tuple[Ints, Array, Array, Ints, Ints, Ints, Array, Ints, Array],
     pairs: Ints,
+    far: float,
     frames: Array,
     world: Array,
     done: Ints,
@@ -194,24 +244,22 @@ def _measure(
     parents, placements, axes, prismatic = tree
     kinds, sizes, corners, tips, firsts, rings, radii, bodies, poses = shapes
     past, at = np.zeros((1, 3)), np.zeros((1, 2), np.int64)
-    place_bodies(q, parents, placements, axes, prismatic, frames)
+    place_bodies(q, parents, placements, axes, prismatic, frames, np.empty((parents.shape[0], 6)))
     done[-1] += 1
     for p in range(pairs.shape[0]):
         i, j = pairs[p, 0], pairs[p, 1]
         put_shape(i, bodies, poses, frames, done, world)
         put_shape(j, bodies, poses, frames, done, world)
         x, y, z = world[i, 0, 3] - world[j, 0, 3], world[i, 1, 3] - world[j, 1, 3], world[i, 2, 3] - world[j, 2, 3]
-        reach = radii[i] + radii[j] + _FAR
+        reach = radii[i] + radii[j] + far
         if x * x + y * y + z * z >= reach * reach:
-            out[p] = _FAR
+            out[p] = far
             continue
         hull = kinds[i] == HULL or kinds[j] == HULL
-        proven = -math.inf if hull else separation(i, j, _FAR, kinds, sizes, world)
-        if proven < _FAR:
+        proven = -math.inf if hull else separation(i, j, far, kinds, sizes, world)
+        if proven < far:
             past[0, 0] = past[0, 1] = past[0, 2] = 0.0  # a posture has nothing to do with the one before
             at[0, 0], at[0, 1] = tips[i], tips[j]
-            more = hull_separation(
-                0, i, j, -math.inf, _FAR, kinds, sizes, corners, firsts, rings, world, past, at, room
-            )
+            more = hull_separation(0, i, j, -math.inf, far, kinds, sizes, corners, firsts, rings, world, past, at, room)
             proven = max(proven, more)
-        out[p] = min(proven, _FAR)
+        out[p] = min(proven, far)

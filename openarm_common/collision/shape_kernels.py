@@ -44,6 +44,19 @@ def _outside(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: 
     return math.sqrt(x * x + y * y + z * z) - s0
 
 
+@inlined_kernel
+def put_shape(k: int, bodies: Ints, poses: Array, frames: Array, done: Ints, world: Array) -> None:
+    """Bring a shape to where its body is, once a state."""
+    b, now = bodies[k], done[done.shape[0] - 1]
+    if b > 0 and done[k] != now:
+        done[k] = now
+        for r in range(3):
+            f0, f1, f2 = frames[b, r, 0], frames[b, r, 1], frames[b, r, 2]
+            for c in range(4):
+                world[k, r, c] = f0 * poses[k, 0, c] + f1 * poses[k, 1, c] + f2 * poses[k, 2, c]
+            world[k, r, 3] += frames[b, r, 3]
+
+
 @bare_kernel
 def separation(i: int, j: int, enough: float, kinds: Ints, sizes: Array, world: Array) -> float:
     """Distance that two shapes are proven to keep (< 0: they overlap no deeper); searched until it is `enough`.

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from openarm_common import se3
 from openarm_common.types import Array
 
 #: A further part must save this share of the volume of the hull about all of a mesh.
@@ -73,7 +74,7 @@ def hull_of(points: Array) -> tuple[Array, float]:
     except (QhullError, ValueError):
         low, high = points.min(axis=0), points.max(axis=0)
         half = 0.5 * np.maximum(high - low, _THIN)
-        corners = 0.5 * (low + high) + half * (2.0 * np.indices((2, 2, 2)).reshape(3, -1).T - 1.0)
+        corners = 0.5 * (low + high) + half * se3.BOX_CORNERS
         return corners, float(np.prod(2.0 * half))
     return points[hull.vertices], float(hull.volume)
 

@@ -96,7 +96,7 @@ class SelfFilter:
         found = [(i, shape) for i, name in enumerate(self._links) for shape in description.links[name].collision]
         self._owners = np.array([i for i, _ in found], np.int64)
         self._kinds = np.array([_KINDS[shape.kind] for _, shape in found], np.int64)
-        self._halves = np.array([_half(shape.kind, shape.size) for _, shape in found]).reshape(-1, 3)
+        self._halves = np.array([shape.half for _, shape in found]).reshape(-1, 3)
         self._T_link_shape = np.array([shape.T_link_primitive for _, shape in found]).reshape(-1, 4, 4)
         self._padding = np.array([special.get(self._links[i], config.padding) for i, _ in found])
 
@@ -164,14 +164,6 @@ class SelfFilter:
 
 
 _KINDS = {"box": kernels.BOX, "cylinder": kernels.CYLINDER, "sphere": kernels.SPHERE}
-
-
-def _half(kind: str, size: tuple[float, ...]) -> tuple[float, float, float]:
-    if kind == "box":
-        return size[0] / 2.0, size[1] / 2.0, size[2] / 2.0
-    if kind == "cylinder":
-        return size[0], size[0], size[1] / 2.0
-    return size[0], size[0], size[0]
 
 
 def _named(shapes: Shapes, counts: Ints) -> dict[str, int]:

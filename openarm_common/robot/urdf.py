@@ -12,13 +12,17 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, cast, get_args
 
 import numpy as np
 
 from openarm_common import se3
 from openarm_common.robot.xml_text import attribute, by_name, fault, floats, parse_root
 from openarm_common.types import Array
+
+if TYPE_CHECKING:
+    from openarm_common.collision.hulls import Hull
 
 Rgba = tuple[float, float, float, float]
 JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
@@ -51,6 +55,26 @@ class Primitive:
     T_link_primitive: Array
     rgba: Rgba | None = None
     corners: Array | None = None
+
+    @property
+    def half(self) -> Array:
+        """(3,) half edges of the box about it, along its own axes, m."""
+        if self.kind == "box":
+            return 0.5 * np.array(self.size)
+        radius = self.size[0]
+        return np.array([radius, radius, 0.5 * self.size[1] if self.kind == "cylinder" else radius])
+
+    @property
+    def points(self) -> Array:
+        """(n, 3) points in its frame whose hull holds it: its corners, or those of the box about it."""
+        return self.half * se3.BOX_CORNERS if self.corners is None else self.corners
+
+    @cached_property
+    def hull(self) -> Hull | None:
+        """Hull of its corners, None for most."""
+        from openarm_common.collision.hulls import Hull
+
+        return None if self.corners is None else Hull.of(self.corners)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_common.collision.body_kernels import place_bodies, put_shape
 from openarm_common.collision.hull_kernels import hull_separation
-from openarm_common.collision.shape_kernels import BOX, HULL, separation
+from openarm_common.collision.shape_kernels import BOX, HULL, put_shape, separation
 from openarm_common.kernels import bare_kernel, inner_kernel, kernel
+from openarm_common.robot.tree_kernels import place_bodies, unplaced
 from openarm_common.types import Array, Ints
 
 #: Numbers that a list of groups or intervals of a line has room for.
@@ -113,7 +113,7 @@ class Work(NamedTuple):
         sways: (moving clusters + m, n + 1) how far, at most, points of a cluster (of a body's spheres) are from where
             they are now in any state of an interval of a line, as seen from a body that carries it, m.
         still: The same for a state alone: zeros.
-        levers: (n, 6) axis and origin of each joint.
+        levers: (n, 6) see `place_bodies`.
         lists: Numbers of groups.
         spans: (k, 4) intervals of a line: first and last point, where the list of its groups begins, its length.
         q: (n,) a state.
@@ -142,12 +142,9 @@ class Work(NamedTuple):
 def workspace(model: Model) -> Work:
     """Room for one thread."""
     n, s, c, g = model.parents.shape[0], model.kinds.shape[0], model.clusters.shape[0], model.groups.shape[0]
-    frames = np.zeros((n + 1, 3, 4))
-    for i in range(3):
-        frames[0, i, i] = 1.0
     world, middles = np.zeros((s, 3, 4)), np.zeros((c, 3))
     work = Work(
-        frames,
+        unplaced(n),
         world,
         np.zeros(s + 1, np.int64),
         middles,
@@ -251,7 +248,7 @@ def place(q: Array, model: Model, work: Work) -> None:
     # fields are unpacked before loops here and below: each access costs a count of references
     frames, middles, parents, placements, axes = work.frames, work.middles, model.parents, model.placements, model.axes
     prismatic, clusters, centres = model.prismatic, model.clusters, model.centres
-    place_bodies(q, parents, placements, axes, prismatic, frames)
+    place_bodies(q, parents, placements, axes, prismatic, frames, work.levers)
     for k in range(model.runs.shape[0] - 1):
         b = clusters[k]
         x, y, z = centres[k, 0], centres[k, 1], centres[k, 2]
@@ -267,12 +264,7 @@ def sway(a: Array, b: Array, share: float, model: Model, work: Work) -> None:
     Joints turn one after the other, the last one first: each moves a point by no more than its turn times the distance
     from its axis, to which what the joints before have moved it is added.
     """
-    frames, axes, prismatic, parents, levers = work.frames, model.axes, model.prismatic, model.parents, work.levers
-    for i in range(parents.shape[0]):
-        for r in range(3):
-            f0, f1, f2 = frames[i + 1, r, 0], frames[i + 1, r, 1], frames[i + 1, r, 2]
-            levers[i, r] = f0 * axes[i, 0] + f1 * axes[i, 1] + f2 * axes[i, 2]
-            levers[i, 3 + r] = frames[i + 1, r, 3]
+    frames, prismatic, parents, levers = work.frames, model.prismatic, model.parents, work.levers
     sways, swings, middles, bounds, clusters = work.sways, model.swings, work.middles, model.bounds, model.clusters
     balls, about = model.sphere_groups, model.sphere_bounds
     moving = sways.shape[0] - balls.shape[0]

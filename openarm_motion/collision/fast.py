@@ -34,8 +34,6 @@ _ROUNDING = 1e-6
 _CELL = 0.045
 #: Of one cell, with nothing near to it.
 _NO_CORNERS = np.empty((0, 3))
-#: Corners of a box of half edges 1.
-_SIGNS = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 _NO_MAP = DistanceMap(np.full((1, 1, 1), np.inf, np.float32), np.zeros(3), 1.0, np.inf)
 
 
@@ -307,7 +305,7 @@ class _Packer:
         if hull is not None:
             return hull.corners
         half = {SPHERE: size[[0, 0, 0]], BOX: size}.get(self._kinds[k], size[[0, 0, 1]])
-        return half * _SIGNS
+        return half * se3.BOX_CORNERS
 
     def _groups(
         self, of: dict[int, int], clusters: list[_Cluster], parents: Sequence[int]

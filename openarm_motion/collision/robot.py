@@ -18,16 +18,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from openarm_common.collision.self_collision import always_touching
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.bodies import Bodies
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.tree import KinematicTree
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid, solid_from
 from openarm_motion.kinematics.chain import ArmKinematics, ArmLinks
 
 _LOG = logging.getLogger(__name__)
-#: Random states in which links that always touch must do so.
-_SAMPLES = 1000
 
 
 class CollisionRobot:
@@ -152,13 +151,13 @@ class CollisionRobot:
 
     def _enabled(self, description: RobotDescription) -> Iterable[tuple[int, int]]:
         """Pairs of shapes to check, of which at least one moves; fingers of a hand are no matter of its arm."""
-        bodies, moving = Bodies.of(description), set(self.moving)
+        tree, moving = KinematicTree(description), set(self.moving)
         carriers = [self._carrier(shape.parentJoint) for shape in self.geometry.geometryObjects]
         for i in self.moving:
             for j, link in enumerate(self.links):
                 if j in moving and (j <= i or carriers[j] == carriers[i]):
                     continue
-                if bodies.checked(self.links[i], link):
+                if tree.checked(self.links[i], link):
                     yield i, j
 
     def _carrier(self, joint: int) -> int:
@@ -174,30 +173,12 @@ class CollisionRobot:
 
         A pair that is apart in a single sample stays: it is then for the SRDF to say that it may touch.
         """
-        pairs: dict[frozenset[str], list[tuple[int, int]]] = {}
-        for i, j in self._enabled(description):
-            pairs.setdefault(frozenset((self.links[i], self.links[j])), []).append((i, j))
-        movable = [j for j in description.joints.values() if j.type != "fixed" and j.mimic is None]
-        names = [joint.name for joint in movable]
-        ends = np.array([(max(j.lower, -np.pi), min(j.upper, np.pi)) for j in movable]).reshape(-1, 2)
-        rng, touching = np.random.default_rng(0), dict(pairs)
-        data, placed = self.model.createData(), pin.GeometryData(self.geometry)
-        for _ in range(_SAMPLES):
-            if not touching:
-                break
-            state = dict(zip(names, rng.uniform(ends[:, 0], ends[:, 1]).tolist(), strict=True))
-            pin.updateGeometryPlacements(self.model, data, self.geometry, placed, self.configuration(state))
-            touching = {k: v for k, v in touching.items() if any(self._touch(i, j, placed) for i, j in v)}
+        pairs = {pair: frozenset((self.links[pair[0]], self.links[pair[1]])) for pair in self._enabled(description)}
+        touching = always_touching(description) & frozenset(pairs.values())
         if touching:
             text = ", ".join(sorted(" and ".join(sorted(pair)) for pair in touching))
-            _LOG.warning("links that touch in each of %d random states are not checked: %s", _SAMPLES, text)
-        kept = [pair for link, found in pairs.items() if link not in touching for pair in found]
-        return tuple(sorted(kept)), frozenset(touching)
-
-    def _touch(self, i: int, j: int, placed: pin.GeometryData) -> bool:
-        first, second = (self.geometry.geometryObjects[k].geometry for k in (i, j))
-        places = [coal.Transform3s(placed.oMg[k].rotation, placed.oMg[k].translation) for k in (i, j)]
-        return coal.collide(first, places[0], second, places[1], coal.CollisionRequest(), coal.CollisionResult()) > 0
+            _LOG.warning("links that touch in each of many random states are not checked: %s", text)
+        return tuple(sorted(pair for pair, links in pairs.items() if links not in touching)), touching
 
 
 def _half_diagonal(shape: coal.CollisionGeometry) -> float:

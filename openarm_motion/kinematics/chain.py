@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.bodies import Bodies
 from openarm_common.robot.description import Joint, RobotDescription
+from openarm_common.robot.tree import KinematicTree, TreeArrays
+from openarm_common.robot.tree_kernels import forward, forward_many, jacobian, unplaced
 from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.kinematics import chain_kernels as kernels
@@ -86,33 +87,20 @@ class ArmKinematics:
         if tool_link not in description.links:
             links = ", ".join(description.links)
             raise OpenArmError(Code.INVALID_ARGUMENT, f"tool link {tool_link!r} is not in the URDF; links: {links}")
-        placements: list[Array] = []
-        axes: list[Array] = []
-        names: list[str] = []
-        kinds: list[bool] = []
-        T = np.eye(4)
-        for joint in description.chain(tool_link):
-            T = T @ joint.T_parent_joint
-            if joint.type == "fixed":
-                continue
-            placements.append(T)
-            axes.append(joint.axis / np.linalg.norm(joint.axis))
-            names.append(joint.name)
-            kinds.append(joint.type == "prismatic")
-            T = np.eye(4)
-        if not names:
+        tree = KinematicTree(description)
+        rows = [i for i, joint in enumerate(tree.joints) if joint in description.chain(tool_link)]
+        if not rows:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no joint moves the tool link {tool_link!r}")
         self.tool_link = tool_link
-        self.names: tuple[str, ...] = tuple(names)
+        self.names: tuple[str, ...] = tuple(tree.joints[i].name for i in rows)
         #: Limits, infinite for joints that turn without end, and the same with half a turn in their place.
         self.lower, self.upper = description.limits(self.names)
         self.span = description.limits(self.names, np.pi)
-        self.placements: Array = np.array(placements)
-        self.axes: Array = np.array(axes)
-        self.prismatic: NDArray[np.bool_] = np.array(kinds)
-        self.tip: Array = T
+        _, placements, axes, prismatic = tree.arrays
+        self.placements, self.axes, self.prismatic = placements[rows], axes[rows], prismatic[rows]
+        self.tip: Array = tree.fixed[tool_link]
         slides = np.where(self.prismatic, np.maximum(np.abs(self.lower), np.abs(self.upper)), 0.0)
-        offsets = np.linalg.norm([*self.placements[1:, :3, 3], T[:3, 3]], axis=1)
+        offsets = np.linalg.norm([*self.placements[1:, :3, 3], self.tip[:3, 3]], axis=1)
         #: The tool is nowhere further than this from the origin of the first joint, m.
         self.reach = float(offsets.sum() + slides.sum())
 
@@ -127,9 +115,9 @@ class ArmKinematics:
         return 0.5 * (self.span[0] + self.span[1])
 
     @property
-    def chain(self) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    def chain(self) -> TreeArrays:
         """The chain as the kernels take it."""
-        return self.placements, self.axes, self.prismatic, self.tip
+        return np.arange(self.n), self.placements, self.axes, self.prismatic
 
     def fk(self, q: ArrayLike) -> Array:
         """`T_base_tool` (4, 4) of a configuration (n,)."""
@@ -137,7 +125,7 @@ class ArmKinematics:
 
     def fk_many(self, q: ArrayLike) -> Array:
         """Tool poses (m, 4, 4) of configurations (m, n)."""
-        return kernels.forward_many(np.ascontiguousarray(q, dtype=np.float64), *self.chain)
+        return forward_many(np.ascontiguousarray(q, dtype=np.float64), *self.chain, self.n, self.tip)
 
     def beyond(self, pose: Array, tolerance: float) -> bool:
         """Whether a pose (4, 4) is certainly out of reach by more than a tolerance, m."""
@@ -145,8 +133,15 @@ class ArmKinematics:
 
     def joint_axes(self, q: ArrayLike) -> tuple[Array, Array]:
         """A point on each joint axis and its direction, (n, 3) each, base frame."""
-        _, origins, directions = self._forward(q)
-        return origins, directions
+        levers = self._forward(q)[1]
+        return levers[:, 3:], levers[:, :3]
+
+    def jacobian(self, q: ArrayLike) -> Array:
+        """(6, n) of the tool's origin: linear velocity over angular velocity, for each joint velocity."""
+        pose, levers = self._forward(q)
+        out = np.empty((6, self.n))
+        jacobian(levers, self.prismatic, pose[:3, 3], out)
+        return out
 
     def margin(self, q: ArrayLike) -> float:
         """Distance to the nearest joint limit, rad; negative outside."""
@@ -208,19 +203,20 @@ class ArmKinematics:
             np.minimum(self.lower + margin, middle),
             np.maximum(self.upper - margin, middle),
             *self.chain,
+            self.tip,
             best,
         )
         return IkResult(bool(success), nearest_turns(best, first, self.upper), float(error_p), float(error_r))
 
-    def _forward(self, q: ArrayLike) -> tuple[Array, Array, Array]:
+    def _forward(self, q: ArrayLike) -> tuple[Array, Array]:
         values = np.ascontiguousarray(q, dtype=np.float64)
         if values.shape != (self.n,):
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"got {values.size} joint positions, expected {self.n}: {', '.join(self.names)}"
             )
-        pose, origins, directions = np.empty((4, 4)), np.empty((self.n, 3)), np.empty((self.n, 3))
-        kernels.forward(values, *self.chain, origins, directions, pose)
-        return pose, origins, directions
+        pose, levers = np.empty((4, 4)), np.empty((self.n, 6))
+        forward(values, *self.chain, self.n, self.tip, unplaced(self.n), levers, pose)
+        return pose, levers
 
 
 @dataclass(frozen=True)
@@ -232,32 +228,28 @@ class ArmLinks:
         gripper: Links that further joints beyond the arm move: the fingers and what is fixed to them.
         hand: The gripper, what carries it, and the tool link: what a held object may touch.
         fixed: Links of the robot that no joint moves.
-        body: Link -> name of the first link of the rigid body that it belongs to.
     """
 
     moving: frozenset[str]
     gripper: frozenset[str]
     hand: frozenset[str]
     fixed: frozenset[str]
-    body: Mapping[str, str]
 
     @classmethod
     def of(cls, description: RobotDescription, kinematics: ArmKinematics) -> ArmLinks:
         """Sort the links of `description` for the arm of `kinematics`."""
         chains = {link: [j for j in description.chain(link) if j.type != "fixed"] for link in description.links}
-        body = Bodies.of(description).body
         moving = {link for link, joints in chains.items() if any(j.name in kinematics.names for j in joints)}
         after = {link: _after(joints, kinematics.names[-1]) for link, joints in chains.items()}
         gripper = {link for link, joints in after.items() if joints}
         carriers = {joints[0].parent for joints in after.values() if joints}
         # without a gripper the last rigid body is the hand
-        hand = gripper | carriers or {link for link in moving if body[link] == body[kinematics.tool_link]}
+        hand = gripper | carriers or {link for link in moving if chains[link][-1] is chains[kinematics.tool_link][-1]}
         return cls(
             moving=frozenset(moving),
             gripper=frozenset(gripper),
             hand=frozenset(hand | {kinematics.tool_link}),
             fixed=frozenset(link for link, joints in chains.items() if not joints),
-            body=body,
         )
 
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numba kernels of a serial chain: forward kinematics, Jacobian, damped least squares.
+"""Numba kernels of the inverse kinematics of a serial chain by damped least squares.
 
-A chain is given by `placements` (n, 4, 4): joint i in the frame of joint i-1 at zero (the first in the base frame),
-`axes` (n, 3): unit joint axes in their joint frames, `prismatic` (n,) bool, and `tip` (4, 4): the tool in the frame of
-the last joint. Angles rad, lengths m, everything expressed in the base frame. The kernels release the GIL.
+A chain is a tree (`tree_kernels.place_bodies`) in which joint i hangs on joint i - 1, and `tip` (4, 4), the tool in the
+frame of the last joint. Angles rad, lengths m, everything expressed in the base frame. The kernels release the GIL.
 """
 
 from __future__ import annotations
@@ -14,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.kernels import kernel
-from openarm_common.types import Array
+from openarm_common.robot.tree_kernels import forward, jacobian, unplaced
+from openarm_common.types import Array, Ints
 
 #: Turns a rotation error (rad) into a length (m) so that both can be minimised together: about the size of a hand.
 ROTATION_LENGTH = 0.2
@@ -25,96 +25,6 @@ _ITERATIONS = 100
 _PULL = 0.05
 #: An attempt is given up after this many iterations that hardly improve.
 _STALL = 5
-
-
-@kernel
-def forward(
-    q: Array,
-    placements: Array,
-    axes: Array,
-    prismatic: NDArray[np.bool_],
-    tip: Array,
-    origins: Array,
-    directions: Array,
-    out: Array,
-) -> None:
-    """Forward kinematics; fills `origins` (n, 3) and `directions` (n, 3) of the joint axes and `out` (4, 4)."""
-    r = np.eye(3)
-    t = np.zeros(3)
-    a = np.empty((3, 3))
-    turn = np.empty((3, 3))
-    for i in range(q.shape[0]):
-        for row in range(3):
-            t[row] += (
-                r[row, 0] * placements[i, 0, 3] + r[row, 1] * placements[i, 1, 3] + r[row, 2] * placements[i, 2, 3]
-            )
-        for row in range(3):
-            for col in range(3):
-                a[row, col] = (
-                    r[row, 0] * placements[i, 0, col]
-                    + r[row, 1] * placements[i, 1, col]
-                    + r[row, 2] * placements[i, 2, col]
-                )
-        x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
-        for row in range(3):
-            origins[i, row] = t[row]
-            directions[i, row] = a[row, 0] * x + a[row, 1] * y + a[row, 2] * z
-        if prismatic[i]:
-            for row in range(3):
-                t[row] += directions[i, row] * q[i]
-                for col in range(3):
-                    r[row, col] = a[row, col]
-            continue
-        c, s = math.cos(q[i]), math.sin(q[i])
-        v = 1.0 - c
-        turn[0, 0] = c + x * x * v
-        turn[0, 1] = x * y * v - z * s
-        turn[0, 2] = x * z * v + y * s
-        turn[1, 0] = y * x * v + z * s
-        turn[1, 1] = c + y * y * v
-        turn[1, 2] = y * z * v - x * s
-        turn[2, 0] = z * x * v - y * s
-        turn[2, 1] = z * y * v + x * s
-        turn[2, 2] = c + z * z * v
-        for row in range(3):
-            for col in range(3):
-                r[row, col] = a[row, 0] * turn[0, col] + a[row, 1] * turn[1, col] + a[row, 2] * turn[2, col]
-    for row in range(3):
-        out[row, 3] = t[row] + r[row, 0] * tip[0, 3] + r[row, 1] * tip[1, 3] + r[row, 2] * tip[2, 3]
-        for col in range(3):
-            out[row, col] = r[row, 0] * tip[0, col] + r[row, 1] * tip[1, col] + r[row, 2] * tip[2, col]
-        out[3, row] = 0.0
-    out[3, 3] = 1.0
-
-
-@kernel
-def forward_many(
-    configurations: Array, placements: Array, axes: Array, prismatic: NDArray[np.bool_], tip: Array
-) -> Array:
-    """Tool poses (m, 4, 4) of configurations (m, n)."""
-    m, n = configurations.shape
-    poses = np.empty((m, 4, 4))
-    origins = np.empty((n, 3))
-    directions = np.empty((n, 3))
-    for k in range(m):
-        forward(configurations[k], placements, axes, prismatic, tip, origins, directions, poses[k])
-    return poses
-
-
-@kernel
-def jacobian(origins: Array, directions: Array, prismatic: NDArray[np.bool_], p: Array, out: Array) -> None:
-    """Geometric Jacobian (6, n) at point `p`: linear rows first, base frame."""
-    for i in range(origins.shape[0]):
-        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
-        if prismatic[i]:
-            out[0, i], out[1, i], out[2, i] = x, y, z
-            out[3, i], out[4, i], out[5, i] = 0.0, 0.0, 0.0
-            continue
-        dx, dy, dz = p[0] - origins[i, 0], p[1] - origins[i, 1], p[2] - origins[i, 2]
-        out[0, i] = y * dz - z * dy
-        out[1, i] = z * dx - x * dz
-        out[2, i] = x * dy - y * dx
-        out[3, i], out[4, i], out[5, i] = x, y, z
 
 
 @kernel
@@ -179,6 +89,7 @@ def solve_ik(
     restarts: int,
     lower: Array,
     upper: Array,
+    parents: Ints,
     placements: Array,
     axes: Array,
     prismatic: NDArray[np.bool_],
@@ -196,7 +107,8 @@ def solve_ik(
         restarts: Further guesses after the first.
         lower: (n,) limits; infinite ones for a joint that turns without end.
         upper: (n,) limits.
-        placements: Chain, see the module's head.
+        parents: Chain, see the module's head.
+        placements: Chain.
         axes: Chain.
         prismatic: Chain.
         tip: Chain.
@@ -208,8 +120,7 @@ def solve_ik(
     n = start.shape[0]
     x = np.empty(n)
     pose = np.empty((4, 4))
-    origins = np.empty((n, 3))
-    directions = np.empty((n, 3))
+    frames, levers = unplaced(n), np.empty((n, 6))
     jac = np.empty((6, n))
     e = np.empty(6)
     h = np.empty((n, n))
@@ -228,7 +139,7 @@ def solve_ik(
             _draw(lower, upper, attempt % 2 == 0, x)
         least, stall = np.inf, 0
         for _ in range(_ITERATIONS):
-            forward(x, placements, axes, prismatic, tip, origins, directions, pose)
+            forward(x, parents, placements, axes, prismatic, n, tip, frames, levers, pose)
             _pose_error(target, pose, e)
             error_p = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
             error_r = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
@@ -246,7 +157,7 @@ def solve_ik(
                 stall += 1
                 if stall > _STALL:
                     break
-            jacobian(origins, directions, prismatic, pose[:3, 3], jac)
+            jacobian(levers, prismatic, pose[:3, 3], jac)
             for row in range(3, 6):
                 e[row] *= w
                 for i in range(n):

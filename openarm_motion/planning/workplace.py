@@ -194,10 +194,7 @@ def _hidden(arm: Arm, q: Array, state: Mapping[str, float], top_z: float, region
     corners: list[Array] = []
     for link in robot.links_of(arm.name):
         for shape in robot.links[link].collision:
-            half = 0.5 * np.array(shape.size if shape.kind == "box" else [2.0 * max(shape.size)] * 3)
-            box = half * np.array(list(product((-1.0, 1.0), repeat=3)))
-            points = box if shape.corners is None else shape.corners
-            corners.append(se3.apply(poses[link] @ shape.T_link_primitive, points))
+            corners.append(se3.apply(poses[link] @ shape.T_link_primitive, shape.points))
     points = np.concatenate([np.zeros((0, 3)), *corners])
     points = points[(points[:, 2] > top_z) & (points[:, 2] < eye[2] - 0.01)]
     seen = eye + (points - eye) * ((eye[2] - top_z) / (eye[2] - points[:, 2]))[:, None]

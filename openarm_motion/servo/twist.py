@@ -12,22 +12,13 @@ from openarm_motion.kinematics.chain import ArmKinematics
 _DAMPED = 0.02
 
 
-def jacobian(kinematics: ArmKinematics, q: Array) -> Array:
-    """(6, n) of the tool's origin: linear velocity over angular velocity, for each joint velocity."""
-    origins, directions = kinematics.joint_axes(q)
-    tool = kinematics.fk(q)[:3, 3]
-    slides = kinematics.prismatic[:, None]
-    linear = np.where(slides, directions, np.cross(directions, tool - origins))
-    return np.concatenate([linear.T, np.where(slides, 0.0, directions).T])
-
-
 def joint_velocities(kinematics: ArmKinematics, q: Array, twist: Array) -> tuple[Array, float]:
     """Least joint velocities (n,) that move the tool by a twist (6,), and the condition number of the Jacobian.
 
     Near a singular posture they are damped, so that they stay bounded; infinite is the condition of an arm with fewer
     than six joints that can move the tool.
     """
-    left, sizes, right = np.linalg.svd(jacobian(kinematics, q), full_matrices=False)
+    left, sizes, right = np.linalg.svd(kinematics.jacobian(q), full_matrices=False)
     damping = np.where(sizes < _DAMPED, _DAMPED**2 - sizes**2, 0.0)
     inverse = sizes / (sizes**2 + damping)
     condition = float(sizes[0] / sizes[-1]) if len(sizes) == 6 and sizes[-1] > 1e-9 else np.inf

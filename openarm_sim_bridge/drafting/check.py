@@ -9,13 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
+from openarm_common.collision.self_collision import LinkContacts
 from openarm_common.config import read_text
 from openarm_common.errors import OpenArmError, said
 from openarm_common.robot.description import RobotDescription, part_faults
 from openarm_common.robot.folder import RobotFolder, read_folder
 from openarm_common.robot.meshes import mesh_file
-from openarm_sim_bridge.drafting.collisions import LinkContacts, corners_of
+from openarm_sim_bridge.drafting.collisions import corners_of
 from openarm_sim_bridge.drafting.semantics import SOURCE
 from openarm_sim_bridge.world.model import import_urdf
 
@@ -46,15 +48,13 @@ def folder_faults(folder: Path) -> list[str]:
         *_pad_faults(parts, robot),
         *_group_faults(robot),
     ]
-    try:
-        contacts = LinkContacts(robot)
-    except OpenArmError as error:
-        return [*faults, error.message, *_mujoco_faults(robot, urdf)]
+    contacts = LinkContacts(robot)
     always = sorted(map(sorted, contacts.always_touching() - robot.allowed_collisions))
     return [
         *faults,
         *_posture_faults(robot, contacts, folder),
         *(f"{' and '.join(pair)} touch in every random state, and the SRDF does not allow it" for pair in always),
+        *_pinocchio_faults(robot),
         *_mujoco_faults(robot, urdf),
     ]
 
@@ -140,6 +140,13 @@ def _posture_faults(robot: RobotDescription, contacts: LinkContacts, folder: Pat
     way = f"give another one in {SOURCE}, or name pairs whose parts don't touch in may_touch there"
     for postures, pairs in by_posture.items():
         yield f"posture {postures}: {', '.join(pairs)} touch; {way}, then `openarm model semantics {folder}`"
+
+
+def _pinocchio_faults(robot: RobotDescription) -> Iterator[str]:
+    try:
+        pin.buildModelFromXML(robot.urdf)
+    except ValueError as error:
+        yield f"pinocchio does not read the URDF: {said(error)}"
 
 
 def _mujoco_faults(robot: RobotDescription, urdf: Path) -> Iterator[str]:

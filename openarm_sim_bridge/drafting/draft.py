@@ -18,13 +18,14 @@ import numpy as np
 import yaml
 
 from openarm_common import se3
+from openarm_common.collision.self_collision import LinkContacts
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Joint, RobotDescription
 from openarm_common.types import Array
 from openarm_sim_bridge.drafting.additions import add_hands, add_masses, add_stand, drives, fix_undriven, fixed_to, lift
 from openarm_sim_bridge.drafting.adopted import AdoptedUrdf
-from openarm_sim_bridge.drafting.collisions import LinkContacts, adjacent_pairs
+from openarm_sim_bridge.drafting.collisions import adjacent_pairs
 from openarm_sim_bridge.drafting.edits import Edits
 from openarm_sim_bridge.drafting.hand import surface
 from openarm_sim_bridge.drafting.mjcf import UrdfDraft, compiled

@@ -17,11 +17,12 @@ from typing import Literal
 
 from pydantic import Field
 
+from openarm_common.collision.self_collision import LinkContacts, Pair
 from openarm_common.config import Config, load_config, read_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import read_folder
-from openarm_sim_bridge.drafting.collisions import LinkContacts, Pair, adjacent_pairs, mirror_links
+from openarm_sim_bridge.drafting.collisions import adjacent_pairs, mirror_links
 
 #: File of the robot's folder that the SRDF is written from.
 SOURCE = "semantics.yaml"

@@ -14,7 +14,7 @@ from openarm_motion.planning.moves import named_posture
 from openarm_motion.servo.arm_servo import ArmServo, Command, Status
 from openarm_motion.servo.course import Course, JointState
 from openarm_motion.servo.surroundings import Surroundings
-from openarm_motion.servo.twist import jacobian, joint_velocities
+from openarm_motion.servo.twist import joint_velocities
 
 pytestmark = pytest.mark.requirement("R-29")
 
@@ -228,7 +228,7 @@ def test_joint_velocities_are_those_of_the_twist(right):
     twist = np.array([0.1, -0.2, 0.05, 0.3, 0.1, -0.2])
     velocity, _ = joint_velocities(right.kinematics, q, twist)
 
-    assert np.allclose(jacobian(right.kinematics, q) @ velocity, twist)
+    assert np.allclose(right.kinematics.jacobian(q) @ velocity, twist)
     step = 1e-6
     moved = right.kinematics.fk(q + step * velocity)[:3, 3] - right.kinematics.fk(q)[:3, 3]
     assert np.allclose(moved / step, twist[:3], atol=1e-4)

@@ -18,9 +18,8 @@ from openarm_common.errors import Code
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import load_folder, robot_names
 from openarm_common.robot.meshes import is_convex, read_mesh
-from openarm_common.robot.urdf import Primitive
 from openarm_sim_bridge.drafting.check import folder_faults
-from openarm_sim_bridge.drafting.collisions import coal_shape, hull_mesh
+from openarm_sim_bridge.drafting.collisions import hull_mesh
 from openarm_sim_bridge.drafting.draft import Draft, draft_folder, mirror_signs
 from openarm_sim_bridge.drafting.mesh_files import simplified, write_stl
 from openarm_sim_bridge.world.model import import_urdf
@@ -385,17 +384,6 @@ def test_arms_are_mirror_images_where_their_axes_are(name):
         tuple(mirror_signs(RobotDescription.load(name), [list(arm.joints) for arm in parts.arms.values()]))
         == parts.mirror
     )
-
-
-def test_a_hull_with_more_triangles_at_a_corner_than_coal_takes_is_rounded_outwards():
-    angle = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
-    rim = 0.1 * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-    cone = np.array([*rim, (0.0, 0.0, 0.2)])
-    shape = coal_shape(Primitive("cone", "box", (0.2, 0.2, 0.2), np.eye(4), corners=cone))
-    points = np.array(shape.points())  # pyright: ignore[reportAttributeAccessIssue]
-    equations = ConvexHull(points).equations
-    assert (cone @ equations[:, :3].T + equations[:, 3]).max() < 1e-6
-    assert np.abs(points).max() < 0.2 + 0.003
 
 
 def test_a_mesh_whose_corners_are_one_has_few_triangles_enough(tmp_path):

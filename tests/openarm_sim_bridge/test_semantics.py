@@ -3,17 +3,18 @@
 
 from __future__ import annotations
 
-import itertools
 import xml.etree.ElementTree as ET
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from openarm_common.collision.self_collision import LinkContacts
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import load_folder, robot_names
-from openarm_sim_bridge.drafting.collisions import LinkContacts, adjacent_pairs, mirror_links
+from openarm_motion.collision.solids import solid_from
+from openarm_sim_bridge.drafting.collisions import adjacent_pairs, mirror_links
 from openarm_sim_bridge.drafting.semantics import SOURCE, SemanticsSource, classify, read_source, srdf_text
 
 ROBOTS = [name for name in robot_names() if (load_folder(name)[0] / SOURCE).is_file()]
@@ -71,13 +72,33 @@ def test_no_pair_that_is_said_never_to_touch_does(robot):
     assert not never & touching
 
 
-def test_leaving_out_shapes_that_are_far_apart_changes_nothing(robot):
-    contacts, rng = LinkContacts(robot, 0.01), np.random.default_rng(3)
-    for _ in range(20):
-        q = contacts._random(rng)
-        pin.computeCollisions(contacts._model, contacts._data, contacts._geometry, contacts._placed, q, False)
-        hits = [result.isCollision() for result in contacts._placed.collisionResults]
-        assert contacts._hits(q, set(contacts._pairs)) == set(itertools.compress(contacts._pairs, hits))
+def test_links_that_touch_are_those_that_the_exact_layer_finds(robot):
+    contacts, rng, margin = LinkContacts(robot, 0.01), np.random.default_rng(3), 0.01
+    model, geometry, owners = pin.buildModelFromXML(robot.urdf), pin.GeometryModel(), []
+    for link in robot.links.values():
+        frame = model.frames[model.getFrameId(link.name, pin.FrameType.BODY)]
+        for shape in link.collision:
+            placement = frame.placement * pin.SE3(shape.T_link_primitive)
+            coal_shape = solid_from(shape.name, np.eye(4), shape).geometry
+            geometry.addGeometryObject(pin.GeometryObject(f"{len(owners)}", frame.parentJoint, placement, coal_shape))
+            owners.append(link.name)
+    geometry.addAllCollisionPairs()
+    data, placed = model.createData(), geometry.createData()
+    joints = [joint for joint in robot.joints.values() if joint.type != "fixed"]
+    for _ in range(5):
+        state = {j.name: rng.uniform(max(j.lower, -np.pi), min(j.upper, np.pi)) for j in joints if j.mimic is None}
+        state |= {j.name: j.multiplier * state[j.mimic] + j.offset for j in joints if j.mimic is not None}
+        q = np.array(pin.neutral(model))
+        for name, value in state.items():
+            at = model.joints[model.getJointId(name)]
+            q[at.idx_q : at.idx_q + at.nq] = value if at.nq == 1 else (np.cos(value), np.sin(value))
+        pin.computeDistances(model, data, geometry, placed, q)
+        near, nearer = set(), set()
+        for pair, result in zip(geometry.collisionPairs, placed.distanceResults, strict=True):
+            links = frozenset((owners[pair.first], owners[pair.second]))
+            near |= {links} if result.min_distance < margin + 1e-4 else set()
+            nearer |= {links} if result.min_distance < margin - 1e-4 else set()
+        assert nearer <= contacts.at(state) <= near
 
 
 @pytest.fixture

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boxes around the robot's shapes: forward kinematics of many postures, and what is hidden."""
+"""Boxes around the robot's shapes: what is hidden."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from openarm_calibration.sampling.bodies import Bodies, chain_poses
+from openarm_calibration.sampling.occluders import Occluders
 from openarm_common.robot.description import RobotDescription
 
 POLE = """<robot name="pole"><link name="base"/>
@@ -17,20 +17,6 @@ POLE = """<robot name="pole"><link name="base"/>
   <origin xyz="0.5 0 0"/><limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
 <joint name="slide" type="prismatic"><parent link="base"/><child link="tip"/><axis xyz="1 0 0"/>
   <limit lower="0" upper="1" velocity="1" effort="1"/></joint></robot>"""
-
-
-@pytest.fixture(scope="module")
-def openarm() -> RobotDescription:
-    return RobotDescription.load()
-
-
-def test_many_postures_at_once_are_those_one_by_one(openarm: RobotDescription) -> None:
-    link = "openarm_right_hand_tcp"
-    names = [joint.name for joint in openarm.chain(link) if joint.type != "fixed"]
-    q = np.random.default_rng(0).uniform(-0.5, 0.5, (5, len(names)))
-    for k, T in enumerate(chain_poses(openarm, link, q)):
-        expected = openarm.link_pose(link, dict(zip(names, q[k].tolist(), strict=True)))
-        np.testing.assert_allclose(T, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +32,7 @@ def test_many_postures_at_once_are_those_one_by_one(openarm: RobotDescription) -
 )
 def test_hidden_is_what_has_a_shape_before_it(eye: tuple, point: tuple, hidden: bool) -> None:
     description = RobotDescription.from_urdf(POLE)
-    bodies = Bodies(description)
-    shapes = bodies.place(description.link_poses({"slide": 0.0, "turn": 0.0}))
+    occluders = Occluders(description)
+    shapes = occluders.place(description.link_poses({"slide": 0.0, "turn": 0.0}))
     far = (3.0, 3.0, 3.0)
-    assert bodies.hidden(shapes, np.array(eye), np.array([far, point])) is hidden
+    assert occluders.hidden(shapes, np.array(eye), np.array([far, point])) is hidden

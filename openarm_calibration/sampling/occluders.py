@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many postures at once: where a link is; whether the robot hides something from a camera.
+"""Whether the robot hides something from a camera.
 
 Hiding goes by boxes around the collision shapes and, where a shape is a hull, by its faces, a little larger than the
 shapes. This sorts postures out before a planner is asked, fast and roughly. Root frame, m.
@@ -12,40 +12,14 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from openarm_calibration.handeye.transforms import exps
-from openarm_common.robot.description import Primitive, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 
 #: Added to half edges.
 _SKIN = 0.004
 
 
-def chain_poses(description: RobotDescription, link: str, q: Array) -> Array:
-    """Return poses (n, 4, 4) of a link for the movable joints of its chain (n, joints), rad or m.
-
-    Args:
-        description: The robot.
-        link: End of the chain.
-        q: (n, joints).
-    """
-    T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    column = 0
-    for joint in description.chain(link):
-        T = T @ joint.T_parent_joint
-        if joint.type == "fixed":
-            continue
-        motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
-        along = q[:, column, None] * joint.axis
-        if joint.type == "prismatic":
-            motion[:, :3, 3] = along
-        else:
-            motion[:, :3, :3] = exps(along)
-        T = T @ motion
-        column += 1
-    return np.array(T)
-
-
-class Bodies:
+class Occluders:
     """The collision shapes of a robot.
 
     Args:
@@ -56,7 +30,7 @@ class Bodies:
         shapes = [(name, shape) for name, link in description.links.items() for shape in link.collision]
         self._links = [name for name, _ in shapes]
         self._T_link_shape: Array = np.array([shape.T_link_primitive for _, shape in shapes]).reshape(-1, 4, 4)
-        half = np.array([_half_edges(shape) for _, shape in shapes]).reshape(-1, 3)
+        half = np.array([shape.half for _, shape in shapes]).reshape(-1, 3)
         self._large: Array = half + _SKIN
         #: Faces (k, 4) of hulls by index, moved outwards by the same: normal, and minus its distance from the origin.
         self._faces: dict[int, Array] = {
@@ -92,13 +66,6 @@ class Bodies:
             _meets(self._faces[i], start[i, 0], way[i]) if i in self._faces else bool((met[i] & (enter[i] > 0.0)).any())
             for i in np.flatnonzero(met.any(axis=1)).tolist()
         )
-
-
-def _half_edges(shape: Primitive) -> tuple[float, ...]:
-    if shape.kind == "box":
-        return tuple(0.5 * edge for edge in shape.size)
-    radius = shape.size[0]
-    return (radius, radius, 0.5 * shape.size[1] if shape.kind == "cylinder" else radius)
 
 
 def _meets(faces: Array, start: Array, ways: Array) -> bool:
