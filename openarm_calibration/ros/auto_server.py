@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +24,7 @@ from openarm_calibration.sampling.samples import SESSION_SUFFIXES, Sample
 from openarm_common import se3
 from openarm_common.asked_files import file_to_write
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.actions import ActionClient, ActionServer, check_alive
+from openarm_common.ros.actions import ActionClient, ActionServer, run_goal
 from openarm_common.ros.convert import matrix_to_pose, vector
 from openarm_common.scene.boards import board_of
 from openarm_common.types import Array
@@ -56,8 +57,6 @@ _ELSEWHERE = frozenset({Code.IN_COLLISION, Code.NO_PLAN, Code.UNREACHABLE, Code.
 _NO_SAMPLE = frozenset({Code.NOTHING_DETECTED, Code.STALE_DATA, Code.MOVING})
 #: Proposals of one search, and poses without a sample in a row before it is given up.
 _AT_ONCE, _MISSES = 15, 6
-#: Longest wait for a server to answer, s of wall clock.
-_ANSWER = 5.0
 #: Images of the moving arm that the delay needs, and are enough.
 _FEWEST_MOVING, _ENOUGH_MOVING = 4, 16
 
@@ -217,35 +216,16 @@ class _Run:
         Raises:
             OpenArmError: Same as /motion/move, or NOT_READY without it; CANCELLED, with the arm stopped.
         """
-        if not await wait_until(self._node, self._mover.server_is_ready, _ANSWER):
-            raise OpenArmError(Code.NOT_READY, "no action /motion/move: is the graph up (openarm up calibrate)?")
         moved, names = self._node.description.arm_joints(self._arm), self._node.samples.joint_names
         positions = [position for name, position in zip(names, q.tolist(), strict=True) if name in moved]
         goal = MoveArm.Goal(arm=self._arm, kind=MoveArm.Goal.JOINTS, joint_positions=positions)
         goal.velocity_scale = scale
         self._surround(goal)
-        died = self._mover.watch()
-        sent = self._mover.send_goal_async(goal)
-        answered = await wait_until(self._node, lambda: sent.done() or bool(died()), _ANSWER)
-        check_alive(died, "/motion/move")
-        if not answered:
-            raise OpenArmError(Code.TIMEOUT, f"/motion/move did not answer within {_ANSWER:g} s")
-        accepted = sent.result()
-        if accepted is None or not accepted.accepted:
-            raise OpenArmError(Code.BUSY, "/motion/move refused the goal")
-        ended = accepted.get_result_async()
-        in_time = await wait_until(
-            self._node, lambda: ended.done() or stopped() or bool(died()), self._config.move_timeout
-        )
-        check_alive(died, "/motion/move")
-        if not ended.done():
-            accepted.cancel_goal_async()  # the motion node stops the arm
-            await wait_until(self._node, ended.done, _ANSWER)
+        until, limit = partial(wait_until, self._node), self._config.move_timeout
+        answer: MoveArm.Result | None = await run_goal(self._mover, goal, until, stopped=stopped, limit=limit)
+        if answer is None or stopped():
             self._check()
-            if not in_time:
-                raise OpenArmError(Code.TIMEOUT, f"a motion took longer than {self._config.move_timeout:g} s")
             return  # stopped for another reason than a cancel
-        answer: MoveArm.Result = ended.result().result
         if not answer.success:
             self._check()
             if answer.code not in Code.__members__:

@@ -8,8 +8,9 @@ the end of its participant's lease. Servers without a lifeline (another vendor's
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -38,6 +39,8 @@ _BEAT_S = 0.5
 _ANSWER_S = 0.5
 #: So often; DDS discovers a client that exists within some of them.
 _ANSWERS = 40
+#: Longest wait for a server, for its answer to a goal, and for the end of one that is cancelled, s.
+_GOAL_S = 5.0
 #: On which every node publishes, so that its participant can be looked up.
 _OF_ALL_NODES = "/parameter_events"
 #: Lifelines of the participants of this process, and the nodes that keep them beating.
@@ -285,3 +288,49 @@ def check_alive(died: Callable[[], str], what: str, code: Code = Code.NOT_READY)
     """
     if who := died():
         raise OpenArmError(code, f"{what}: {who} is gone; ask again when it is back (openarm ps)")
+
+
+async def run_goal(
+    client: ActionClient,
+    goal: Any,
+    until: Callable[[Callable[[], bool], float], Awaitable[bool]],
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+    limit: float = math.inf,
+) -> Any:
+    """Send a goal and return its result, also that of a failure; it is cancelled when it takes too long or is stopped.
+
+    Args:
+        client: Client of the action.
+        goal: Goal to send.
+        until: Awaits a condition for a time, s, and returns whether it holds.
+        stopped: Whether the goal is to be cancelled.
+        limit: Longest wait for its end, s.
+
+    Returns:
+        The result; None of a goal that was stopped and has not ended in time.
+
+    Raises:
+        OpenArmError: NOT_READY, without a server, or when it dies; BUSY, when it refuses the goal; TIMEOUT.
+    """
+    name = client.name
+    if not await until(client.server_is_ready, _GOAL_S):
+        raise OpenArmError(Code.NOT_READY, f"no action server {name}; is its node running (openarm ps)?")
+    died = client.watch()
+    sent = client.send_goal_async(goal)
+    answered = await until(lambda: sent.done() or bool(died()), _GOAL_S)
+    check_alive(died, name)
+    if not answered:
+        raise OpenArmError(Code.TIMEOUT, f"{name} did not answer within {_GOAL_S:g} s")
+    handle: Any = sent.result()
+    if handle is None or not handle.accepted:
+        raise OpenArmError(Code.BUSY, f"{name} refused the goal")
+    ended = handle.get_result_async()
+    in_time = await until(lambda: ended.done() or stopped() or bool(died()), limit)
+    check_alive(died, name)
+    if not ended.done():
+        handle.cancel_goal_async()
+        await until(ended.done, _GOAL_S)
+        if not in_time:
+            raise OpenArmError(Code.TIMEOUT, f"{name} took longer than {limit:g} s")
+    return ended.result().result if ended.done() else None

@@ -12,7 +12,7 @@ from moveit_msgs.msg import MotionPlanRequest, MoveItErrorCodes
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.actions import ActionClient
+from openarm_common.ros.actions import ActionClient, run_goal
 from openarm_common.ros.node import BaseNode
 from openarm_motion.config import MoveGroupConfig
 from openarm_motion.ros.move_group.codes import MoveItError
@@ -116,14 +116,8 @@ class Hands:
         else:
             goal = ParallelGripperCommand.Goal()
             goal.command.name, goal.command.position = [finger], [position]
-        handle: Any = await client.send_goal_async(goal)
-        if not handle.accepted:
-            raise OpenArmError(Code.EXECUTION_FAILED, f"{client.name} rejected the position {position:g} of {finger}")
-        ended = handle.get_result_async()
-        await Watch(self._service.robot).until(lambda: ended.done() or stopped())
-        if not ended.done():
-            await handle.cancel_goal_async()
-        result = (await ended).result
+        watch = Watch(self._service.robot)
+        result = await run_goal(client, goal, lambda done, limit: watch.until(done, limit=limit), stopped=stopped)
         if stopped():
             raise OpenArmError(Code.CANCELLED, f"cancelled; the {arm} hand holds where it is")
         if not (result.reached_goal or result.stalled):
