@@ -7,7 +7,7 @@ import math
 import time
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -39,10 +39,9 @@ from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.requests.task import GraspSession, Status
 from openarm_grasp.requests.task import Task as GraspTask
 from openarm_grasp.robot.coordination import ArmCoordination, coordinated
-from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
-from openarm_grasp.strategies.pair import Pair
-from openarm_grasp.strategies.registry import carry_out, carry_out_pair
+from openarm_grasp.strategies.pair import pick_two
+from openarm_grasp.strategies.registry import carry_out
 from openarm_sim_bridge.faults.faults import checked_fault
 
 _SETTLE_S = 0.5
@@ -110,7 +109,7 @@ class Trials:
         clearance = watch_clearance(self.robot) if two else None
         began_ns = self.robot.t_ns
         pair = self._task.together and not self._task.clear
-        trials = self._both([GraspRequest(label) for label in self._task.labels]) if pair else self._ordered()
+        trials = self.link.run(self._both(*map(GraspRequest, self._task.labels))) if pair else self._ordered()
         row = row_of(self._task, trials, time.monotonic() - began)
         row["again"], row["left"] = self._again, list(self._left)
         row["sim_s"] = round(self._seconds, 2) or row["sim_s"]
@@ -168,16 +167,11 @@ class Trials:
     async def _grasp(self, ask: GraspRequest) -> Trial:
         """Carry out one request and judge it: at once where the other arm may be at work, else when all is at rest."""
         task, robot, began, steps = self._task, self.robot, time.monotonic(), list[Step]()
-        arms = (ask.arm,) if ask.arm != "auto" else robot.description.arm_names
         if not task.together:
             await self._begin(lifted=ask.phase == "place")
         since_ns = robot.t_ns
         request = replace(ask, arm=task.arm if ask.arm == "auto" else ask.arm, place=task.place, place_on=task.place_on)
-        try:
-            with self._coordination.taking(arms, ask.label):
-                outcome = await carry_out(self.grasp_task(request, steps, alone=len(arms) > 1))
-        except OpenArmError as error:
-            outcome = GraspOutcome(error.code, error.message, ask.label)
+        outcome = await self._carry_out(request, steps, alone=ask.arm == "auto")
         wall_s = time.monotonic() - began
         return await self._trial(
             ask.label, outcome, steps, wall_s, since_ns if task.together and ask.phase != "place" else 0
@@ -189,26 +183,34 @@ class Trials:
             track.clear()
         await self.robot.wait(0.1)
 
-    def _both(self, asked: Sequence[GraspRequest]) -> list[Trial]:
+    async def _carry_out(self, request: GraspRequest, steps: list[Step], *, alone: bool) -> GraspOutcome:
+        """Carry out one request with all arms, or with the one that it names."""
+        arms = self.robot.description.arm_names if alone else (request.arm,)
+        try:
+            with self._coordination.taking(arms, request.label):
+                return await carry_out(self.grasp_task(request, steps, alone=alone))
+        except OpenArmError as error:
+            return GraspOutcome(error.code, error.message, request.label)
+
+    async def _both(self, first: GraspRequest, second: GraspRequest) -> list[Trial]:
         """Ask for two objects at once, of both arms."""
         began = time.monotonic()
         steps: tuple[list[Step], list[Step]] = ([], [])
-        robots: dict[str, RobotInterface] = {arm: self.link.next_to_other() for arm in self.robot.description.arm_names}
-        first, second = asked
 
-        def report(status: Status) -> None:
-            self._report(status)
-            steps[status.request].append(self.steps[-1])
+        def carry_out_one(i: int, request: GraspRequest) -> Awaitable[GraspOutcome]:
+            return self._carry_out(request, steps[i], alone=request.arm == "auto")
 
-        pair = Pair(self.session, self.skills, robots, (first, second), report, carry_out)
-        self.link.run(self._begin())
+        await self._begin()
         outcomes: Sequence[GraspOutcome]
         try:
-            outcomes = self.link.run(carry_out_pair(pair)).answers
+            both = await pick_two(
+                self.session, self.skills, (first, second), lambda work: work(), carry_out_one, lambda _: None
+            )
+            outcomes = both.answers
         except OpenArmError as error:
-            outcomes = [GraspOutcome(error.code, error.message, ask.label) for ask in asked]
-        wall_s, labels = 0.5 * (time.monotonic() - began), [ask.label for ask in asked]
-        return [self.link.run(self._trial(*each, wall_s)) for each in zip(labels, outcomes, steps, strict=True)]
+            outcomes = [GraspOutcome(error.code, error.message, ask.label) for ask in (first, second)]
+        wall_s, labels = 0.5 * (time.monotonic() - began), (first.label, second.label)
+        return [await self._trial(*each, wall_s) for each in zip(labels, outcomes, steps, strict=True)]
 
     def grasp_task(self, request: GraspRequest, steps: list[Step] | None = None, *, alone: bool = True) -> GraspTask:
         """A request, to be carried out by a strategy.

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 #: What to pick, and what to put it on or in.
 _ON = re.compile(r"(.*?)\s*\b(?:on|in):\s*(\S.*)", re.DOTALL)
+#: These end a request, and one that runs at the same time; nothing else is tried.
+ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST, Code.STOPPED)
 #: What a request may ask for.
 PHASES = ("all", "pick", "place", "aside")
 
@@ -130,31 +132,25 @@ class GraspRequest:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{scale}, expected {LEAST_SCALE:g} to 1, or 0 for the usual one")
 
 
-def command(requests: Sequence[GraspRequest]) -> str:
-    """Return the command line that asks for the same again: of one request, or of two at once.
+def command(request: GraspRequest) -> str:
+    """Return the command line that asks for the same again.
 
-    An option that only one of two requests has is left out, and so are objects that stay where they are: the command
-    line has no words for them.
+    Objects that stay where they are are left out: the command line has no words for them.
     """
-    first = requests[0]
-    words = ["openarm", "pick", *(request.label for request in requests if request.label)]
-    options: dict[str, list[tuple[object, ...] | None]] = {
-        "--arm": [None if first.arm == "auto" and len(requests) == 1 else (request.arm,) for request in requests],
-        "--at": [request.object_at for request in requests],
-        "--place": [request.place and (*request.place, 0.0)[:3] for request in requests],
-        "--place-on": [(request.place_on,) if request.place_on else None for request in requests],
-        "--yaw": [None if request.place_yaw is None else (math.degrees(request.place_yaw),) for request in requests],
+    words = ["openarm", "pick", *([request.label] if request.label else [])]
+    options: dict[str, Sequence[object] | None] = {
+        "--arm": None if request.arm == "auto" else (request.arm,),
+        "--at": request.object_at,
+        "--place": request.place and (*request.place, 0.0)[:3],
+        "--place-on": (request.place_on,) if request.place_on else None,
+        "--yaw": None if request.place_yaw is None else (math.degrees(request.place_yaw),),
+        "--phase": None if request.phase == "all" else (request.phase,),
+        "--time-limit": (f"{request.timeout:g}",) if request.timeout else None,
+        "--speed": (f"{request.velocity_scale:g}",) if request.velocity_scale else None,
     }
     for name, values in options.items():
-        if None not in values:
-            words += [word for value in values for word in (name, *map(str, value or ()))]
-    if first.phase != "all":
-        words += ["--phase", first.phase]
-    if first.timeout:
-        words += ["--time-limit", f"{first.timeout:g}"]
-    if first.velocity_scale:
-        words += ["--speed", f"{first.velocity_scale:g}"]
-    return shlex.join([*words, *(["--dry-run"] if first.dry_run else [])])
+        words += [] if values is None else [name, *map(str, values)]
+    return shlex.join([*words, *(["--dry-run"] if request.dry_run else [])])
 
 
 @dataclass(frozen=True)
@@ -258,7 +254,6 @@ class PairOutcome:
         message: Sentences on each.
         simultaneous: Both arms worked at the same time.
         duration: s of robot time.
-        recording: Path of the flight recording of a failure; "" when there is none.
     """
 
     answers: tuple[GraspOutcome, ...]
@@ -266,7 +261,21 @@ class PairOutcome:
     message: str
     simultaneous: bool = False
     duration: float = 0.0
-    recording: str = ""
+
+    @classmethod
+    def of(
+        cls, answers: tuple[GraspOutcome, GraspOutcome], why: str, duration: float, *, simultaneous: bool
+    ) -> PairOutcome:
+        """The answer to both; `why` they were, or were not, carried out at the same time."""
+        codes = [answer.code for answer in answers if not answer.success]
+        code = Code.CANCELLED if Code.CANCELLED in codes else next(iter(codes), Code.OK)
+        text = "; ".join(f"{answer.label}: {answer.message}" for answer in answers)
+        return cls(answers, code, f"{why}. {text}", simultaneous, duration)
+
+    @property
+    def recording(self) -> str:
+        """Path of the flight recording of the first failure that has one, or ""."""
+        return next((answer.recording for answer in self.answers if answer.recording), "")
 
     @property
     def success(self) -> bool:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from openarm_interfaces.srv import SaveRecording
@@ -11,7 +10,7 @@ from rclpy.task import Future
 
 from openarm_common.errors import Code
 from openarm_common.ros.node import BaseNode
-from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome, command
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest, command
 
 #: Longest wait for the path, s of wall clock: the answer to the request waits as long.
 _WAIT_S = 0.8
@@ -30,19 +29,13 @@ class FlightRecorderClient:
         self._node = node
         self._client = node.create_client(SaveRecording, "/flight_recorder/save")
 
-    async def save(self, outcome: GraspOutcome | PairOutcome, requests: Sequence[GraspRequest]) -> str:
-        """Return the path of the recording of a failure; "" for a success, for a plan alone, and when nobody records.
-
-        Args:
-            outcome: Outcome of the request.
-            requests: Requests: one, or two at once.
-        """
-        if outcome.kind in ("SUCCESS", "CANCELLED") or outcome.code in _OF_REQUEST or requests[0].dry_run:
+    async def save(self, outcome: GraspOutcome, request: GraspRequest) -> str:
+        """Return the path of the recording of a failure; "" for a success, for a plan alone, and when nobody records."""
+        if outcome.kind in ("SUCCESS", "CANCELLED") or outcome.code in _OF_REQUEST or request.dry_run:
             return ""
         if not self._client.service_is_ready():
             return ""
-        asked = "; ".join(map(repr, requests))
-        reason = f"{outcome.code}: {_line(outcome.message)}\nrequest: {_line(asked)}\nagain: {command(requests)}"
+        reason = f"{outcome.code}: {_line(outcome.message)}\nrequest: {_line(repr(request))}\nagain: {command(request)}"
         answer: Any = self._client.call_async(SaveRecording.Request(reason=reason))
         ended = Future(executor=self._node.executor)
         timer = self._node.create_timer(_WAIT_S, lambda: _end(ended), clock=self._node.steady_clock)

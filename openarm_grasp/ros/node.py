@@ -36,26 +36,25 @@ from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutco
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import GraspSession, Status, Task
 from openarm_grasp.robot.coordination import ArmCoordination, coordinated
-from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.learn import learn_hand
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.ros import messages
 from openarm_grasp.ros.flight_recorder_client import FlightRecorderClient
 from openarm_grasp.ros.graph_robot import GraphRobot
 from openarm_grasp.sampling.samplers import make_sampler
-from openarm_grasp.strategies.pair import Pair
-from openarm_grasp.strategies.registry import carry_out, carry_out_pair
+from openarm_grasp.strategies.pair import Requests, pick_two
+from openarm_grasp.strategies.registry import carry_out
 
-AnswerT = TypeVar("AnswerT", GraspOutcome, PairOutcome, str)
+AnswerT = TypeVar("AnswerT")
 OutcomeT = TypeVar("OutcomeT", GraspOutcome, PairOutcome)
-OnStatus = Callable[[int, GraspStatus], None]
+OnStatus = Callable[[GraspStatus], None]
 
 #: Latched, and deep enough that two transitions in a row both arrive.
 _QOS_STATUS = QoSProfile(depth=20, reliability=QOS_LATCHED.reliability, durability=QOS_LATCHED.durability)
 
 
 class GraspNode(BaseNode[GraspConfig]):
-    """Serves a request for each arm at a time, or one for both; another meanwhile is answered at once with BUSY.
+    """Serves a request for each arm at a time, or one for all; another meanwhile is answered at once with BUSY.
 
     A request for an arm by name takes that arm alone, and one for any arm both of them, or the one that is free.
     """
@@ -73,8 +72,8 @@ class GraspNode(BaseNode[GraspConfig]):
         #: What each arm is at work on, for the answer to what comes meanwhile.
         self._coordination = ArmCoordination()
         self._newest: dict[int, Status] = {}
-        #: What a cancel of a goal reaches, by id of the goal.
-        self._cancels: dict[bytes, Sequence[GraphRobot]] = {}
+        #: What a cancel of a goal reaches, by id of each goal that is carried out.
+        self._cancels: dict[bytes, list[GraphRobot]] = {}
         self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
         self._marker_topic = self.create_publisher(MarkerArray, "/grasp/markers", QOS_LATCHED)
         self.create_service(Grasp, "/grasp", self._on_grasp)
@@ -140,7 +139,7 @@ class GraspNode(BaseNode[GraspConfig]):
         return response
 
     async def _on_pick(self, goal: ServerGoalHandle) -> Pick.Result:
-        def feedback(_: int, status: GraspStatus) -> None:
+        def feedback(status: GraspStatus) -> None:
             goal.publish_feedback(Pick.Feedback(status=status))
 
         request, result = messages.request_from_msg(goal.request), Pick.Result()
@@ -151,12 +150,18 @@ class GraspNode(BaseNode[GraspConfig]):
         def feedback(which: int, status: GraspStatus) -> None:
             goal.publish_feedback(PickTwo.Feedback(request=which, status=status))
 
-        requests = messages.requests_from_msg(goal.request)
-        return messages.pair_result(await self._as_goal(goal, self._two(requests, feedback, goal)))
+        on_status = partial(feedback, 0), partial(feedback, 1)
+        two = self._two(messages.requests_from_msg(goal.request), on_status, goal)
+        return messages.pair_result(await self._as_goal(goal, two))
 
     async def _as_goal(self, goal: ServerGoalHandle, work: Awaitable[OutcomeT]) -> OutcomeT:
         """Carry a goal out."""
-        outcome = await work
+        self._cancels[_id_of(goal)] = []
+        try:
+            outcome = await work
+        finally:
+            del self._cancels[_id_of(goal)]
+            self._rest()
         if outcome.success:
             goal.succeed()
         elif goal.is_cancel_requested and outcome.code is Code.CANCELLED:
@@ -166,7 +171,7 @@ class GraspNode(BaseNode[GraspConfig]):
         return outcome
 
     def _on_cancel(self, goal: ServerGoalHandle) -> CancelResponse:
-        robots = self._cancels.get(_id_of(goal), ())
+        robots = self._cancels.get(_id_of(goal), [])
         for robot in robots:
             robot.cancel()
         return CancelResponse.ACCEPT if robots else CancelResponse.REJECT
@@ -224,7 +229,7 @@ class GraspNode(BaseNode[GraspConfig]):
 
         try:
             outcome = await self._take(
-                _grasp_of(request.cut()), arms, work, robots=(robot,), goal=goal, moves=not request.dry_run
+                _grasp_of(request.cut()), arms, work, robot=robot, goal=goal, moves=not request.dry_run
             )
         except OpenArmError as error:
             request = request.cut()
@@ -232,31 +237,29 @@ class GraspNode(BaseNode[GraspConfig]):
             outcome = GraspOutcome(error.code, error.message, request.label)
         else:
             self._report(outcome)
-        return replace(outcome, recording=await self._flight_recorder.save(outcome, (request,)))
+        return replace(outcome, recording=await self._flight_recorder.save(outcome, request))
 
-    async def _two(
-        self, requests: tuple[GraspRequest, GraspRequest], on_status: OnStatus, goal: ServerGoalHandle
-    ) -> PairOutcome:
-        report = partial(self._publish, on_status=on_status)
-        each = {arm: self._robot.next_to_other() for arm in self._arms}
-        robots: dict[str, RobotInterface] = {**each}
+    async def _two(self, asked: Requests, on_status: Sequence[OnStatus], goal: ServerGoalHandle) -> PairOutcome:
+        named = _grasp_of(*(request.cut() for request in asked))
 
-        async def work() -> PairOutcome:
-            await self._learn_unknown(self._robot, self._arms, *requests)
-            return await carry_out_pair(Pair(self._session, self._skills, robots, requests, report, carry_out))
+        def with_all_arms(work: Callable[[], Awaitable[Requests]]) -> Awaitable[Requests]:
+            async def learned() -> Requests:
+                await self._learn_unknown(self._robot, self._arms, *asked)
+                return await work()
 
-        named = _grasp_of(*(request.cut() for request in requests))
+            return self._take(named, self._arms, learned, goal=goal, moves=not asked[0].dry_run)
+
+        def carry_out_one(i: int, request: GraspRequest) -> Awaitable[GraspOutcome]:
+            return self._one(request, on_status[i], goal)
+
+        def note(reason: str) -> None:
+            self._publish(Status(State.IDLE, State.IDLE, reason), on_status[0])
+
         try:
-            outcome = await self._take(
-                named, self._arms, work, robots=(self._robot, *each.values()), goal=goal, moves=not requests[0].dry_run
-            )
+            return await pick_two(self._session, self._skills, asked, with_all_arms, carry_out_one, note)
         except OpenArmError as error:
-            requests = (requests[0].cut(), requests[1].cut())
-            self._refused(f"grasp of {requests[0].label!r} and {requests[1].label!r}", error)
-            outcome = PairOutcome((), error.code, error.message)
-        for answer in outcome.answers:
-            self._report(answer)
-        return replace(outcome, recording=await self._flight_recorder.save(outcome, requests))
+            self._refused(named, error)
+            return PairOutcome((), error.code, error.message)
 
     async def _take(
         self,
@@ -264,7 +267,7 @@ class GraspNode(BaseNode[GraspConfig]):
         arms: Sequence[str],
         work: Callable[[], Awaitable[AnswerT]],
         *,
-        robots: Sequence[GraphRobot] = (),
+        robot: GraphRobot | None = None,
         goal: ServerGoalHandle | None = None,
         moves: bool = True,
     ) -> AnswerT:
@@ -274,26 +277,29 @@ class GraspNode(BaseNode[GraspConfig]):
             what: Description of the work.
             arms: Arms that it needs.
             work: Carries it out.
-            robots: Those that a cancel of the goal reaches; none: the one of all arms.
+            robot: Robot that a cancel of the goal reaches; None: that of all arms.
             goal: Goal that asks for it; None: a service does.
             moves: It will move arms.
 
         Raises:
             OpenArmError: BUSY, NOT_READY or INVALID_ARGUMENT, when it is not taken; CANCELLED before it began.
         """
-        robots = robots or (self._robot,)
+        robot = robot or self._robot
+        cancels = [] if goal is None else self._cancels[_id_of(goal)]
         try:
             with self._coordination.taking(arms, what):
-                if goal is not None:
-                    self._cancels[_id_of(goal)] = robots
+                cancels.append(robot)
                 named = " and ".join(dict.fromkeys(self._coordination.at_work.values()))
-                await robots[0].begin(named, arms if moves else ())
+                await robot.begin(named, arms if moves else ())
                 return await work()
         finally:
-            if goal is not None:
-                self._cancels.pop(_id_of(goal), None)
-            if not self._coordination.at_work:
-                self._robot.end()
+            cancels[:] = [one for one in cancels if one is not robot]
+            self._rest()
+
+    def _rest(self) -> None:
+        """Stop listening when nothing is carried out any more."""
+        if not (self._coordination.at_work or self._cancels):
+            self._robot.end()
 
     def _refused(self, what: str, error: OpenArmError, index: int = 0) -> None:
         self.get_logger().warning(f"{what} refused: {error}")
@@ -329,7 +335,7 @@ class GraspNode(BaseNode[GraspConfig]):
         message = messages.status_msg(status, self.description.base, t_ns)
         self._status_topic.publish(message)
         if on_status is not None:
-            on_status(status.request, message)
+            on_status(message)
         if status.state is State.IDLE:
             # The newest status is not that of one which has ended while the other is at work.
             for other in self._newest.values():

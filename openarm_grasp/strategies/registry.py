@@ -14,14 +14,13 @@ from dataclasses import replace
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.requests.request import GraspOutcome, PairOutcome
+from openarm_grasp.requests.request import ENDS, GraspOutcome
 from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.aside import aside
 from openarm_grasp.strategies.direct import direct
 from openarm_grasp.strategies.hand_over import hand_over
 from openarm_grasp.strategies.height import height
 from openarm_grasp.strategies.in_hand import take_up
-from openarm_grasp.strategies.pair import ENDS, Pair, in_turn, simultaneous
 from openarm_grasp.strategies.push import push
 
 Strategy = Callable[[Task], Awaitable[GraspOutcome | None]]
@@ -67,16 +66,3 @@ async def carry_out(task: Task) -> GraspOutcome:
     if task.outcome is None:
         raise OpenArmError(Code.INTERNAL, f"none of the strategies {', '.join(STRATEGIES)} answered")
     return task.answer(task.outcome, "")
-
-
-async def carry_out_pair(pair: Pair) -> PairOutcome:
-    """Carry out two requests: at the same time where that can be planned, else one after the other.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT or NOT_READY, when a request is not taken; CANCELLED, TIMEOUT or ROBOT_LOST,
-            when both ended before an object was touched.
-    """
-    await take_up(pair.session, pair.robot, *pair.requests)
-    pair.check()
-    outcome = await simultaneous(pair)
-    return await in_turn(pair) if outcome is None else outcome

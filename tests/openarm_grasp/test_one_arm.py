@@ -19,8 +19,9 @@ from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.strategies.hand_over import hand_over
-from openarm_grasp.strategies.pair import simultaneous
+from openarm_grasp.strategies.pair import _an_arm_for_each
 from openarm_sim_bridge.world.model import PhysicsConfig, robot_spec
 from openarm_sim_bridge.world.world import start_qpos
 
@@ -61,12 +62,9 @@ def test_what_takes_two_arms_is_not_offered(robot: RobotDescription) -> None:
         context=context, outcome=object(), request=SimpleNamespace(place=(0.4, 0.0)), findings=findings
     )
     assert asyncio.run(hand_over(cast("Any", task))) is None
-    request, notes = SimpleNamespace(label="red", place=None), list[str]()
-    pair = SimpleNamespace(
-        requests=(request, request), session=SimpleNamespace(context=context), note=notes.append, reason=""
-    )
-    assert asyncio.run(simultaneous(cast("Any", pair))) is None
-    assert "one arm" in notes[-1]
+    both, session = (GraspRequest("red"), GraspRequest("blue")), SimpleNamespace(context=context)
+    shared = asyncio.run(_an_arm_for_each(cast("Any", session), cast("Any", SimpleNamespace(now_ns=1)), both))
+    assert shared == (both, "the robot has one arm: one after the other")
     for suite in ("handover", "push", "pairs"):
         with pytest.raises(OpenArmError, match="needs two arms"):
             make_task(suite, 0)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,12 +21,9 @@ from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutco
 from openarm_grasp.requests.states import Hand, State
 from openarm_grasp.requests.task import Grasp, GraspSession
 from openarm_grasp.robot.interface import PlanGrasp
-from openarm_grasp.strategies.pair import check_pair
 from openarm_grasp.strategies.run import Run
 from tests.openarm_grasp.scripted import GoHome, Grip, World, standing
 from tests.refusals import refused, refuses
-
-ARMS = ("left", "right")
 
 
 def kept(arm: str, label: str) -> Grasp:
@@ -131,25 +127,6 @@ def test_the_outcome_of_two_is_given_in_one_word(first: str, second: str, kind: 
         outcome = PairOutcome((ends[one], ends[other]), Code.OK if one == other == "done" else Code.NO_PLAN, "")
         assert (outcome.kind, outcome.success) == (kind, kind == "SUCCESS")
     assert PairOutcome((), Code.BUSY, "").kind == "REFUSED"
-
-
-def test_two_requests_for_what_may_be_one_object_are_refused() -> None:
-    def refusal(*pair: GraspRequest) -> str:
-        with refuses(Code.INVALID_ARGUMENT) as error:
-            check_pair((pair[0], pair[1]), ARMS)
-        return error.value.message
-
-    red, blue = GraspRequest("red"), GraspRequest("blue")
-    check_pair((red, blue), ARMS)
-    check_pair((red, red), ARMS)  # of several, any two
-    for pair in product((red, GraspRequest("")), repeat=2):
-        if pair != (red, red):
-            assert "need a label each" in refusal(*pair)
-    here, near, away = (GraspRequest("red", object_at=(0.26, y)) for y in (0.2, 0.11, 0.0))
-    check_pair((here, away), ARMS)
-    assert "90 mm apart, expected more than 100 mm" in refusal(here, near)
-    assert "phase 'pick' is of one alone" in refusal(red, GraspRequest("blue", phase="pick"))
-    assert "valid: auto, left, right" in refusal(red, GraspRequest("blue", arm="middle"))
 
 
 BOX = Box("target/blue", np.eye(4), np.array([0.05, 0.04, 0.06]))

@@ -74,7 +74,7 @@ def test_one_of_two_that_is_not_in_view_is_refused_and_the_other_placed_and_ther
     assert [one.outcome for one in answer.results] == ["REFUSED", "SUCCESS"]
     assert "no 'mug' in view" in answer.message
     assert answer.recording == "/recordings/1"
-    assert asked[0].splitlines()[2] == "again: openarm pick mug blue --arm auto --arm auto"
+    assert asked[0].splitlines()[2] == "again: openarm pick mug"
     assert len(asked) == 1
     assert bench.ask("", phase="place").code == "NOT_READY"
 

@@ -75,7 +75,7 @@ def test_two_objects_are_picked_at_once_each_by_its_arm_and_each_publishes_its_s
 
 
 @pytest.mark.long
-def test_one_request_at_a_time_and_the_newest_status_is_of_the_one_that_is_at_work(bench) -> None:
+def test_the_arm_that_has_ended_is_free_and_the_newest_status_is_of_the_one_that_is_at_work(bench) -> None:
     held_up = Future()
     bench.world.during = lambda what: held_up if bench.world.asked[-1][0] == "left" else None
     _, result = bench.ros.send_goal(bench.two, goal("red", "blue"))
@@ -85,12 +85,12 @@ def test_one_request_at_a_time_and_the_newest_status_is_of_the_one_that_is_at_wo
     again = bench.status[ended + 1]
     assert (again.label, again.arm, again.state) == ("blue", "left", "MOVE_TO_PREGRASP")
     assert again.previous_state == again.state
-    answer = bench.ask("red")
+    answer = bench.ask("red", arm="left")
     assert (answer.code, answer.success) == ("BUSY", False)
-    assert "a grasp of 'red' and 'blue' is running" in answer.message
+    assert "a grasp of 'blue' is running" in answer.message
     busy = ask(bench, "red", "blue")
     assert (busy.code, busy.outcome, len(busy.results)) == ("BUSY", "REFUSED", 0)
-    handle, _ = bench.ros.send_goal(bench.action, Pick.Goal(label="red"))
+    handle, _ = bench.ros.send_goal(bench.action, Pick.Goal(label="red", arm="left"))
     assert not bench.ros.result(handle.cancel_goal_async()).goals_canceling
     held_up.set_result(None)
     assert bench.ros.result(result, 60.0).result.success
