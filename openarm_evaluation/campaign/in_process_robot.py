@@ -14,9 +14,8 @@ from openarm_common.types import Array
 from openarm_control.gripper import GripperGoal, GripperOutcome
 from openarm_evaluation.campaign.robot import SimRobot
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import Box as GraspBox
-from openarm_grasp.planning.options import NoWayError
+from openarm_grasp.planning.options import NoWayError, Refusal
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, check_deadline, slowed
 from openarm_grasp.robot.interface import Trajectory as AnyTrajectory
 from openarm_motion.collision.solids import Box
@@ -168,7 +167,12 @@ class InProcessRobot:
             boxes_of(request.ignore_regions),
         )
         answer = await self._asked(lambda stopped: self.robot.motion.plan_approach(asked, stopped))
-        refusals = {refused.id: Verdict(refused.code, refused.message) for refused in answer.refusals}
+        refusals = {
+            one.id: Refusal(
+                one.code, one.message, bodies=(one.contact.first, one.contact.second) if one.contact else ()
+            )
+            for one in answer.refusals
+        }
         plan = answer.plan
         if plan is None:
             raise NoWayError(answer.code, answer.message, refusals) from answer.error

@@ -17,6 +17,13 @@ from openarm_grasp.planning.candidates import GraspCandidate, wide_edges
 NO_WAY = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN, Code.TOO_WIDE)
 
 
+@dataclass(frozen=True)
+class Refusal(Verdict):
+    """Why the planner refused a way, and the two bodies that would meet; none, when it is for another reason."""
+
+    bodies: tuple[str, ...] = ()
+
+
 class NoWayError(OpenArmError):
     """The planner refused every way that it was offered.
 
@@ -26,7 +33,7 @@ class NoWayError(OpenArmError):
         refusals: Why each was refused, by id.
     """
 
-    def __init__(self, code: Code, message: str, refusals: Mapping[str, Verdict]) -> None:
+    def __init__(self, code: Code, message: str, refusals: Mapping[str, Refusal]) -> None:
         super().__init__(code, message)
         self.refusals = refusals
 
@@ -78,7 +85,7 @@ def planned(
     arm: str,
     offered: Sequence[GraspCandidate],
     chosen: int,
-    refusals: Mapping[str, Verdict],
+    refusals: Mapping[str, Refusal],
     limit_margins: Sequence[float],
 ) -> Options:
     """The options after a plan; `chosen` is an index of `offered`, -1 when all were refused."""

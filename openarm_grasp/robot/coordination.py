@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coordination of two arms that work at the same time: they observe in turn, and one waits for the other to leave.
 
-That two arms in motion keep their clearance is validated by motion, which delays the later one. What is left is an arm
-at rest in the way: the other waits until it has gone on. Of two that wait for each other, the one that comes second in
-the order of arms gives up, and goes home as after every failure. An arm at work is left alone; another may be sent
-home. Base frame, m, rad.
+That two arms in motion keep their clearance is validated by motion, which delays the later one. An arm plans when the
+other has begun what it has planned, so that each plan knows of all that moves. What is left is an arm at rest in the
+way: the other waits until it has gone on. Of two that wait for each other, the one that comes second in the order of
+arms gives up, and goes home as after every failure. An arm at work is left alone; another may be sent home. Base frame,
+m, rad.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -26,8 +28,8 @@ from openarm_grasp.robot.skills import Skills
 
 T = TypeVar("T")
 
-#: An arm that has turned a joint so far has gone on, rad.
-_GONE_ON = 0.1
+#: An arm that has turned a joint so far has begun a motion, or has gone on, rad.
+_BEGUN, _GONE_ON = 0.02, 0.1
 
 
 @dataclass
@@ -36,6 +38,7 @@ class ArmCoordination:
 
     Attributes:
         at_work: Work of each arm, by arm; others rest.
+        planned: Joints (n,) at which each arm plans, or has planned, what it may not have begun yet, rad by arm.
         waiting: Arms that wait until the other goes on.
         observing: The arm that observes; "" when none does.
         seen: Newest frames of the camera over the table, by the arm that observed.
@@ -43,6 +46,7 @@ class ArmCoordination:
     """
 
     at_work: dict[str, str] = field(default_factory=dict[str, str])
+    planned: dict[str, Array] = field(default_factory=dict[str, Array])
     waiting: set[str] = field(default_factory=set[str])
     observing: str = ""
     seen: dict[str, Frames] = field(default_factory=dict[str, Frames])
@@ -64,6 +68,7 @@ class ArmCoordination:
         finally:
             for arm in arms:
                 self.at_work.pop(arm, None)
+                self.planned.pop(arm, None)
 
 
 class CoordinatedRobot:
@@ -105,6 +110,7 @@ class CoordinatedRobot:
         waits until the other one hides nothing any more.
         """
         coordination, limit, robot = self._coordination, self._config.limits.beside_timeout, self._robot
+        coordination.planned.pop(self.arm, None)
         begins, self._begun = not self._begun, True
         again, self._observed = self._observed, self._observed or not near
         known = coordination.seen.get(self.arm, Frames((), "")).frames[-count:]
@@ -134,7 +140,7 @@ class CoordinatedRobot:
     # --- planning and moving
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Plan; again when the other arm has gone on."""
-        return await self._patiently(lambda: self._robot.plan(request), "planning")
+        return await self._patiently(lambda: self._in_turn(lambda: self._robot.plan(request)), "planning")
 
     async def follow(
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
@@ -142,6 +148,7 @@ class CoordinatedRobot:
         """Follow a planned trajectory, when the other arm leaves clearance for it."""
         self._observed = False
         await self._patiently(lambda: self._robot.follow(arm, trajectory, what, guard), what)
+        self._coordination.planned.pop(self.arm, None)
 
     async def move(
         self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
@@ -155,7 +162,8 @@ class CoordinatedRobot:
         if arm != self._other:
             self._observed = False
             await self._robot.until(lambda: coordination.sent_home != arm, self._config.limits.beside_timeout, what)
-            await self._patiently(work, what)
+            await self._patiently(lambda: self._in_turn(work), what)
+            coordination.planned.pop(arm, None)
             return
         if arm in coordination.at_work:
             return
@@ -169,12 +177,24 @@ class CoordinatedRobot:
             coordination.sent_home = ""
 
     # --- the other arm
+    async def _in_turn(self, work: Callable[[], Awaitable[T]]) -> T:
+        """Plan when the other arm has begun what it has planned."""
+        planned = self._coordination.planned
+
+        def begun() -> bool:
+            return self._other not in planned or self._has_turned(planned[self._other], _BEGUN)
+
+        await self._robot.until(begun, inf, f"the {self._other} arm is about to move")
+        planned[self.arm] = self._pose(self.arm)
+        return await work()
+
     async def _patiently(self, work: Callable[[], Awaitable[T]], what: str) -> T:
         end_ns = self._robot.now_ns + round(self._config.limits.beside_timeout * 1e9)
         while True:
             try:
                 return await work()
             except OpenArmError as error:
+                self._coordination.planned.pop(self.arm, None)
                 if not self._in_the_way(error) or self._robot.now_ns > end_ns:
                     raise
                 if not await self._gone_on(what):
@@ -186,8 +206,8 @@ class CoordinatedRobot:
             return False
         if error.code is Code.NO_PLAN or not isinstance(error, NoWayError):
             return True
-        reasons = (error.message, *(one.reason for one in error.refusals.values()))
-        return any(link in reason for link in self._robot.description.links_of(self._other) for reason in reasons)
+        links = {*self._robot.description.links_of(self._other)}
+        return any(links.intersection(refusal.bodies) for refusal in error.refusals.values())
 
     async def _gone_on(self, what: str) -> bool:
         """Wait until the other arm has gone on; false when it waits for this one, and this one is to give way."""
@@ -195,8 +215,11 @@ class CoordinatedRobot:
         gives_way = self._robot.description.arm_names.index(self.arm) > 0
 
         def over() -> bool:
-            moved = float(np.max(np.abs(self._pose(self._other) - before))) > _GONE_ON
-            return moved or self._other_is_away() or (gives_way and self._other in coordination.waiting)
+            return (
+                self._has_turned(before, _GONE_ON)
+                or self._other_is_away()
+                or (gives_way and self._other in coordination.waiting)
+            )
 
         coordination.waiting.add(self.arm)
         try:
@@ -205,6 +228,10 @@ class CoordinatedRobot:
         finally:
             coordination.waiting.discard(self.arm)
         return not (gives_way and self._other in coordination.waiting)
+
+    def _has_turned(self, before: Array, by: float) -> bool:
+        """Whether the other arm has turned a joint so far since."""
+        return float(np.max(np.abs(self._pose(self._other) - before))) > by
 
     def _pose(self, arm: str) -> Array:
         _, q = self._robot.states.latest()

@@ -16,9 +16,9 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.types import Array
 from openarm_grasp.config import LEAST_SCALE
-from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget
+from openarm_grasp.planning.options import Refusal
 
 Trajectory: TypeAlias = object
 
@@ -95,7 +95,7 @@ class Planned:
     transfer: Trajectory
     approach: Trajectory
     retreat: Trajectory
-    refusals: Mapping[str, Verdict] = field(default_factory=dict[str, Verdict])
+    refusals: Mapping[str, Refusal] = field(default_factory=dict[str, Refusal])
     limit_margins: tuple[float, ...] = ()
     start: Mapping[str, float] = field(default_factory=dict[str, float])
     duration: float = 0.0

@@ -30,7 +30,7 @@ class FlightRecorderClient:
         self._client = node.create_client(SaveRecording, "/flight_recorder/save")
 
     async def save(self, outcome: GraspOutcome, request: GraspRequest) -> str:
-        """Return the path of the recording of a failure; "" for a success, for a plan alone, and when nobody records."""
+        """Return the path of the recording of a failure; "" for a success, for a dry run, and when nobody records."""
         if outcome.kind in ("SUCCESS", "CANCELLED") or outcome.code in _OF_REQUEST or request.dry_run:
             return ""
         if not self._client.service_is_ready():

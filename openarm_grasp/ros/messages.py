@@ -25,9 +25,8 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, point, stamp_to_ns, vector, xyz
 from openarm_common.types import Array
 from openarm_grasp.config import GripperAction
-from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget
-from openarm_grasp.planning.options import NoWayError, Option
+from openarm_grasp.planning.options import NoWayError, Option, Refusal
 from openarm_grasp.requests.confirm import ShownPlan
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome
 from openarm_grasp.requests.task import Status
@@ -255,7 +254,10 @@ def planned_from_msg(result: PlanApproach.Result, offered: int, *, blend: bool =
     Raises:
         OpenArmError: the planner's code, when it found no plan; INTERNAL, when it chose what was not offered.
     """
-    refusals = {r.id: Verdict(code_from_text(r.code, Code.NO_PLAN), r.message) for r in result.refusals}
+    refusals = {
+        r.id: Refusal(code_from_text(r.code, Code.NO_PLAN), r.message, bodies=(r.first, r.second))
+        for r in result.refusals
+    }
     if not result.success:
         raise NoWayError(code_from_text(result.code, Code.NO_PLAN), result.message or "no plan", refusals)
     if not 0 <= result.chosen < offered:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
-from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox, CollisionObject, PlanFailure
+from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox, CollisionObject, PlanFailure, Refusal
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -23,7 +23,7 @@ from openarm_common.ros.convert import (
 )
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Cylinder, Mesh, Solid, Sphere
-from openarm_motion.planning.approach import ApproachRequest, Target
+from openarm_motion.planning.approach import ApproachRequest, Refused, Target
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.service.requests import (
     ArmGoal,
@@ -99,6 +99,14 @@ def solid_msg(solid: Solid, frame: str) -> CollisionObject:
     message.pose.pose = matrix_to_pose(solid.T)
     if isinstance(solid, Mesh):
         message.vertices = [point(vertex) for vertex in solid.vertices]
+    return message
+
+
+def refusal_msg(refused: Refused) -> Refusal:
+    """Convert the reason why a target was not chosen."""
+    message = Refusal(id=refused.id, code=refused.code.value, message=refused.message)
+    if refused.contact is not None:
+        message.first, message.second = refused.contact.first, refused.contact.second
     return message
 
 

@@ -14,7 +14,6 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
-from openarm_interfaces.msg import Refusal
 from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
 from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
@@ -157,7 +156,7 @@ class MotionNode(BaseNode[MotionConfig]):
         if answer.plan is not None:
             result.chosen, result.limit_margins = answer.plan.chosen, list(answer.plan.limit_margins)
             result.transfer, result.approach, result.retreat = map(convert.trajectory_msg, answer.plan.parts)
-        result.refusals = [Refusal(id=r.id, code=r.code.value, message=r.message) for r in answer.refusals]
+        result.refusals = [convert.refusal_msg(refused) for refused in answer.refusals]
         return _end(handle, result, answer)
 
     async def _on_move(self, handle: ServerGoalHandle) -> MoveArm.Result:

@@ -11,9 +11,8 @@ import pytest
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Frame
-from openarm_grasp.planning.options import NoWayError
+from openarm_grasp.planning.options import NoWayError, Refusal
 from openarm_grasp.robot.coordination import ArmCoordination, CoordinatedRobot
 from openarm_grasp.robot.interface import Frames
 from tests.refusals import refused
@@ -113,7 +112,7 @@ def test_what_is_not_the_other_arms_doing_is_reported_at_once() -> None:
 def test_a_plan_that_other_things_are_in_the_way_of_is_not_tried_again_when_the_arm_has_gone_on(meets, waits) -> None:
     robot = Robot()
     robot.away("right")
-    refusals = {"a": Verdict(Code.UNREACHABLE, "too far"), "b": Verdict(Code.IN_COLLISION, f"link7 would hit {meets}")}
+    refusals = {"a": Refusal(Code.UNREACHABLE, "too far"), "b": Refusal(Code.IN_COLLISION, "", bodies=("link7", meets))}
     robot.faults = [NoWayError(Code.IN_COLLISION, "a: link6 would hit detected/red_1", refusals)]
     robot.on_step = lambda step: robot.away("right", 0.2)
     if waits:
@@ -121,6 +120,32 @@ def test_a_plan_that_other_things_are_in_the_way_of_is_not_tried_again_when_the_
     else:
         refused("red_1", run, link(robot, "left").plan(None))  # type: ignore[arg-type]
     assert robot.steps == waits
+
+
+def test_an_arm_plans_when_the_other_has_begun_what_it_has_planned() -> None:
+    robot, coordination = Robot(), ArmCoordination(dict.fromkeys(("left", "right"), "a grasp"))
+    right, left = (link(robot, arm, coordination) for arm in ("right", "left"))
+    run(right.plan(None))  # type: ignore[arg-type]
+    robot.on_step = lambda step: robot.away("right", 0.05) if step == 3 else None
+    run(left.plan(None))  # type: ignore[arg-type]
+    assert robot.steps == 3
+    run(right.observe(3))  # which has begun, and plans anew
+    robot.on_step = lambda step: coordination.planned.pop("left") if step == 5 else None
+    run(right.plan(None))  # type: ignore[arg-type]
+    assert robot.steps == 5
+
+
+def test_a_plan_in_vain_and_the_end_of_a_request_let_the_other_arm_plan() -> None:
+    robot, coordination = Robot(), ArmCoordination({"left": "a grasp"})
+    robot.faults = [Code.UNREACHABLE]
+    with coordination.taking(("right",), "a grasp"):
+        right = link(robot, "right", coordination)
+        refused("in the way", run, right.plan(None))  # type: ignore[arg-type]
+        run(link(robot, "left", coordination).plan(None))  # type: ignore[arg-type]
+        del coordination.planned["left"]
+        run(right.plan(None))  # type: ignore[arg-type]
+    run(link(robot, "left", coordination).plan(None))  # type: ignore[arg-type]
+    assert robot.steps == 0
 
 
 def test_of_two_arms_that_wait_for_each_other_the_right_one_gives_way() -> None:
