@@ -3,9 +3,9 @@
 
 Each word must be an attribute of the object (its name, colour or shape), or choose among those that fit; a relation
 compares it with another object that is described in the same way. No word is known beforehand: the attributes of what
-is in view are the vocabulary. The easiest object lies under nothing, has room around it, and is seen surely; an easy
-one about so ("leftmost easy can"). Capitals and punctuation make no difference. Sides are those of the robot's view:
-left is +y of the base frame, right -y, behind +x, in front -x.
+is in view are the vocabulary. The easiest object lies under nothing, has room around it, and is seen surely. Capitals
+and punctuation make no difference. Sides are those of the robot's view: left is +y of the base frame, right -y, behind
++x, in front -x.
 """
 
 from __future__ import annotations
@@ -37,11 +37,12 @@ _RELATIONS: Mapping[Words, tuple[float, float] | None] = {
     ("nearest", "to"): None,
     ("closest", "to"): None,
 }
-#: Chooses what needs the least to be taken.
-EASIEST, EASY = "easiest", "easy"
-_CHOICES: Mapping[str, Callable[[Detection, Sequence[Detection]], float]] = {
+#: Chooses what needs the least to be taken; or, of those that need about so little, the outermost on a side.
+EASIEST, EASIEST_LEFT, EASIEST_RIGHT = "easiest", "easiest_left", "easiest_right"
+_CHOICES: Mapping[str, Callable[[Detection, Sequence[Detection]], float | tuple[float, float]]] = {
     EASIEST: lambda one, others: _trouble(one, others),
-    EASY: lambda one, others: round(_trouble(one, others)),
+    EASIEST_LEFT: lambda one, others: (round(_trouble(one, others)), -float(one.p_base[1])),
+    EASIEST_RIGHT: lambda one, others: (round(_trouble(one, others)), float(one.p_base[1])),
     "largest": lambda one, _: -float(np.prod(one.size)),
     "biggest": lambda one, _: -float(np.prod(one.size)),
     "smallest": lambda one, _: float(np.prod(one.size)),
@@ -55,6 +56,8 @@ _CHOICES: Mapping[str, Callable[[Detection, Sequence[Detection]], float]] = {
     "closest": lambda one, _: float(np.hypot(*one.p_base[:2])),
     "farthest": lambda one, _: -float(np.hypot(*one.p_base[:2])),
 }
+#: Which of several that fit comes first; "": as they are given.
+SELECTIONS = ("", *_CHOICES)
 #: Boxes nearer than this touch; a top that is so much higher is over another; more room counts no more, m.
 _TOUCHING, _HIGHER, _ROOM = 0.005, 0.01, 0.05
 _NO_PUNCTUATION = str.maketrans(dict.fromkeys(string.punctuation, " "))
@@ -67,26 +70,30 @@ def fits(text: str, one: Described) -> bool:
 
 
 def takes_all(text: str) -> bool:
-    """Return whether words ask for whatever there is, as `anything` does; the easiest first, or any."""
-    return all(word in _ANY | _FILLERS or word == EASIEST for word in _words(text))
+    """Return whether words ask for whatever there is, as `anything` does."""
+    return all(word in _ANY | _FILLERS for word in _words(text))
 
 
-def select(text: str, detections: Sequence[Detection]) -> tuple[Detection, ...]:
+def select(text: str, detections: Sequence[Detection], selection: str = "") -> tuple[Detection, ...]:
     """Return the objects that are asked for.
 
     Args:
         text: Words; relations may follow each other. Without any, all are.
         detections: Objects in view, the first choice at the front.
+        selection: Selection among what the words leave open, of `SELECTIONS`.
 
     Returns:
-        The best first, at least one: by the choice in the words, the distance to the object of a relation, or else in
-        the order in which they are given.
+        The best first, at least one: by the choice in the words, the distance to the object of a relation, or else by
+        the selection, or in the order in which they are given.
 
     Raises:
         OpenArmError: NOTHING_DETECTED, when nothing is in view; UNKNOWN_OBJECT, listing what is.
     """
     if not detections:
         raise OpenArmError(Code.NOTHING_DETECTED, f"nothing is in view (asked for {text or 'any object'!r})")
+    if selection:
+        choice, given = _CHOICES[selection], detections
+        detections = sorted(given, key=lambda one: choice(one, given))
     words = _words(text)
     return tuple(_select(text, words, detections) if words else detections)
 

@@ -7,7 +7,7 @@ import math
 import sys
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -85,25 +85,30 @@ def pick(
     from openarm_grasp.requests.request import GraspRequest
     from openarm_grasp.ros.client import GraspClient
 
-    wanted: list[dict[str, Any]] = [
-        {
-            "label": name if on is None else f"{name} on:{on}",
-            "arm": which or "auto",
-            "place": where,
-            "place_yaw": None if turn is None else math.radians(turn),
-            "object_at": spot,
-        }
+    wanted = [
+        GraspRequest.of(
+            name,
+            arm=which or "auto",
+            place=where,
+            place_yaw=None if turn is None else math.radians(turn),
+            object_at=spot,
+            phase=phase,
+            dry_run=dry_run,
+            timeout=time_limit,
+            velocity_scale=speed,
+            **({} if on is None else {"place_on": on}),
+        )
         for name, which, where, on, turn, spot in zip(labels, arms, places, supports, yaws, spots, strict=True)
     ]
-    run: dict[str, Any] = {"dry_run": dry_run, "time_limit": time_limit, "speed": speed, "timeout": timeout}
-    run["on_feedback"] = _Steps(labels)
+    steps = _Steps(labels)
     with requires_node("grasp", "sim"), GraspClient() as client:
         try:
             if second:
-                first, other = (GraspRequest.of(request.pop("label"), **request) for request in wanted)
-                return _of_two(client.pick_two(first, other, **run), dry_run=dry_run)
+                how: dict[str, Any] = {"dry_run": dry_run, "time_limit": time_limit, "speed": speed}
+                both = client.pick_two(*wanted, **how, timeout=timeout, on_feedback=steps)
+                return _of_two(both, dry_run=dry_run)
             ask = confirm and (_runs if sys.stdin.isatty() else True)
-            result = client.pick(**wanted[0], phase=phase, confirm=ask, **run)
+            result = client.carry_out(wanted[0], confirm=ask, timeout=timeout, on_feedback=steps)
         except KeyboardInterrupt as interrupt:
             asked = {"labels": labels} if second else {"label": label}
             if isinstance(interrupt.__context__, KeyboardInterrupt):  # the second, before the goal has ended
@@ -221,20 +226,6 @@ def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
     return Outcome(result.success, result.message, result.code, data, text + _kept(result.recording))
 
 
-def _answer(client: GraspClient, ask: GraspRequest, speed: float, timeout: float) -> GraspResult:
-    """Return what came of a request of an order."""
-    return client.pick(
-        ask.label,
-        arm=ask.arm,
-        phase=ask.phase,
-        object_at=ask.object_at,
-        exclude_near=ask.exclude_near,
-        place_choices=ask.place_choices,
-        speed=speed,
-        timeout=timeout,
-    )
-
-
 def order(
     *labels: str,
     bins: Path | None = None,
@@ -272,18 +263,22 @@ def order(
         try:
             while True:
                 while (ask := work.next()) is not None:
-                    running[pool.submit(_answer, client, ask, speed, timeout)] = ask
+                    asked = replace(ask, velocity_scale=speed)
+                    running[pool.submit(client.carry_out, asked, timeout=timeout)] = ask
                 if not running:
                     break
                 for answer in wait(running, return_when=FIRST_COMPLETED).done:
                     ask, result = running.pop(answer), answer.result()
                     seen = result.object_position
                     how = {"touched": result.attempts > 0, "held": result.outcome == "PARTIAL"}
-                    work.done(ask, result.code, result.message, result.place_position, seen, **how)
-                    row = {"label": ask.label, "position": seen and list(seen), "code": result.code}
+                    ends = result.place_position, seen
+                    left = work.done(ask, result.code, result.message, *ends, **how, by=result.arm)
+                    label = work.label_of(ask)
+                    row = {"label": label, "position": seen and list(seen), "code": result.code}
                     place = list(result.place_position) if result.success else None
                     results.append({**row, "message": result.message, "place": place})
-                    shown.print(f"{ask.label}: {result.code}: {result.message}", markup=False)
+                    if left is not None or result.code not in (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED):
+                        shown.print(f"{label}: {result.code}: {result.message}", markup=False)
         except BaseException as error:
             while running and wait(running, _CANCEL_S).not_done:  # one that was just begun, too
                 client.cancel()
@@ -292,8 +287,8 @@ def order(
             data = {"placed": work.placed, "results": results}
             return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, data)
     faults = work.faults()
-    left = [{**asdict(one), "code": str(one.code)} for one in work.left]
-    data = {"outcome": work.outcome, "placed": work.placed, "left": left, "faults": list(faults), "results": results}
+    remain = [{**asdict(one), "code": str(one.code)} for one in work.left]
+    data = {"outcome": work.outcome, "placed": work.placed, "left": remain, "faults": list(faults), "results": results}
     message = f"{work.outcome}: {len(work.placed)} placed, {len(work.left)} left"
     return Outcome(
         not faults, message, Code.OK if not faults else Code.PLACE_FAILED, data, "".join(f"left: {t}\n" for t in faults)

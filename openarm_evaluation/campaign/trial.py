@@ -142,7 +142,8 @@ class Trials:
                 answer, touched = trial.answer, trial.answer.attempts > 0
                 held = isinstance(answer, GraspOutcome) and answer.held
                 ends = answer.place_position, answer.object_position
-                left = order.done(ask, Code(answer.code), answer.message, *ends, touched=touched, held=held)
+                how = {"touched": touched, "held": held}
+                left = order.done(ask, Code(answer.code), answer.message, *ends, **how, by=answer.arm)
                 if ask.phase == "aside":
                     continue
                 if answer.success:

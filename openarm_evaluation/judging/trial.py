@@ -212,8 +212,7 @@ def run_trial(
     observer.forget()
 
     def request() -> Sequence[GraspResult]:
-        words = replace(wanted, label=wanted.label or item.label).words
-        return [client.pick(words, arm=wanted.arm, place=wanted.place)]
+        return [client.carry_out(replace(wanted, label=wanted.label or item.label))]
 
     (trial,) = _observed(observer, scene, seed, [item], request, wanted.place, wanted.place_on)
     return trial

@@ -169,7 +169,7 @@ def average(track: Sequence[Detection]) -> Detection:
     return replace(reference, score=score, T_base_object=T, size=size, round=around, kind=kind, measured=measured)
 
 
-def in_view(frames: Sequence[Frame], label: str) -> tuple[Detection, ...]:
+def in_view(frames: Sequence[Frame], label: str, selection: str = "") -> tuple[Detection, ...]:
     """What words fit in the newest frame, the first choice at the front.
 
     Raises:
@@ -178,7 +178,7 @@ def in_view(frames: Sequence[Frame], label: str) -> tuple[Detection, ...]:
     fault: OpenArmError | None = None
     for frame in reversed(frames):
         try:
-            fitting = select(label, frame.detections)
+            fitting = select(label, frame.detections, selection)
         except OpenArmError as error:
             fault = fault or error
             continue
@@ -193,6 +193,7 @@ def find(
     label: str,
     limits: DetectConfig,
     *,
+    selection: str = "",
     at: Sequence[float] | None = None,
     exclude_near: Sequence[Spot] = (),
     exclude_parts: Sequence[Array] = (),
@@ -204,6 +205,7 @@ def find(
         frames: Frames, at least one, oldest first; every detection has an id.
         label: Object to look for, in words; "" takes any. Of those that fit, the first is taken.
         limits: Limits of how much an object may seem to move.
+        selection: Selection among those that fit, as `openarm_common.wanted.select`.
         at: (x, y) where it stands, m; None: anywhere.
         exclude_near: (x, y) of objects that are excluded, m.
         exclude_parts: (n, 2) points of others that are excluded, m.
@@ -216,7 +218,8 @@ def find(
             UNKNOWN_OBJECT, naming what is in view; STALE_DATA, when the object was not in the newest frame and two
             thirds of all, or moved between them.
     """
-    anchor = _same(frames, same) if same else _anchor(in_view(frames, label), label, at, exclude_near, exclude_parts)
+    fitting = () if same else in_view(frames, label, selection)
+    anchor = _same(frames, same) if same else _anchor(fitting, label, at, exclude_near, exclude_parts)
     sights = [_Sight(d, _labelled(frame, d)) for frame in frames for d in frame.detections if d.id == anchor.id]
     track, enough = [one for one in sights if one.shown.measured], 2 * len(frames)
     if 3 * len(track) < enough:  # a part of something of unknown shape is taken on its points

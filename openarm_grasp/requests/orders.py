@@ -153,7 +153,8 @@ class Order:
     moves any more, or when all that moves does so in vain.
 
     Attributes:
-        labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
+        labels: Words of a user for objects, in this order; each is asked for until none is left, as often as `each` says
+            at most.
         bins: Bins that they go into; None: to free spots.
         each: Most objects of one label, or of each label; 0: all.
         arms: Arms that work at the same time; fewer than two: one request at a time.
@@ -171,6 +172,9 @@ class Order:
     left: list[Left] = field(default_factory=list[Left])
     failed: dict[str, str] = field(default_factory=dict[str, str])
     running: list[GraspRequest] = field(default_factory=list[GraspRequest])
+    #: What is asked for, by label, and the labels of whatever there is.
+    _asks: dict[str, GraspRequest] = field(default_factory=dict[str, GraspRequest])
+    _any: set[str] = field(default_factory=set[str])
     #: Where what was placed stands, and what a hand may hold.
     _stand: list[Spot] = field(default_factory=list[Spot])
     _held: list[str] = field(default_factory=list[str])
@@ -198,6 +202,8 @@ class Order:
         if homeless and self.bins is not None:
             known = ", ".join(self.bins.classes) or "no label"
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no bin for {', '.join(homeless)}; there are bins for {known}")
+        self._asks = {label: replace(GraspRequest.of(label), selection="") for label in self.labels}
+        self._any = {label for label, ask in self._asks.items() if takes_all(ask.label)}
 
     def next(self) -> GraspRequest | None:
         """The next request that may begin now; None: not before another has ended, or, when none runs, never."""
@@ -223,7 +229,7 @@ class Order:
         arm = self._able[0] if self._stopped else _ANY_ARM
         if self._held:
             held = self._held[0]
-            return GraspRequest(f"{EASIEST} {held}", arm, phase="place", place_choices=self._spots(held))
+            return replace(self._asks[held], arm=arm, phase="place", place_choices=self._spots(held))
         wanted = self._wanted()
         for label in wanted:
             if not self._exhausted(label, arm):
@@ -239,11 +245,12 @@ class Order:
         stay = tuple(self._stand)
         for one in left:
             if one.where is not None and one.code in _BY_PLACE and not self._was_asked_for(one.where):
-                spots = self._spots(one.label)
-                return GraspRequest(one.label, arm, object_at=one.where, exclude_near=stay, place_choices=spots)
+                ask, spots = self._asks[one.label], self._spots(one.label)
+                return replace(ask, arm=arm, object_at=one.where, exclude_near=stay, place_choices=spots)
         for code, one in product(_IN_THE_WAY, left):
             if one.code is code and one.where is not None and self._may_push(one.label, one.where):
-                return GraspRequest(one.label, arm, object_at=one.where, exclude_near=stay, phase="aside")
+                ask = self._asks[one.label]
+                return replace(ask, arm=arm, object_at=one.where, exclude_near=stay, phase="aside")
         return None
 
     def _wanted(self, *taken: str) -> list[str]:
@@ -270,7 +277,8 @@ class Order:
         left = (one.where for one in self.left if one.where is not None and stays(one))
         # of one bin, the last arm fills the other end
         spots = self._spots(label)[:: -1 if arm in self.arms[1:] else 1]
-        return GraspRequest(f"{EASIEST} {label}", arm, exclude_near=(*self._stand, *left), place_choices=spots)
+        ask, stay = self._asks[label], (*self._stand, *left)
+        return replace(ask, arm=arm, selection=EASIEST, exclude_near=stay, place_choices=spots)
 
     @property
     def _given_up(self) -> bool:
@@ -291,7 +299,7 @@ class Order:
     def _may_push(self, label: str, where: Spot) -> bool:
         pushed = [one.request.object_at for one in self._in_vain if one.aside]
         known = any(spot is not None and math.dist(where, spot[:2]) < SAME_SPOT for spot in pushed)
-        return takes_all(label) and len(pushed) < _PUSHES and not known
+        return label in self._any and len(pushed) < _PUSHES and not known
 
     def _enough(self, label: str, *taken: str) -> bool:
         most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
@@ -308,10 +316,10 @@ class Order:
     def _spots(self, label: str) -> tuple[Spot, ...]:
         return () if self.bins is None else self.bins.bins[self.bins.of(label)].slots(self.bins.spacing)
 
-    @staticmethod
-    def label_of(request: GraspRequest) -> str:
+    def label_of(self, request: GraspRequest) -> str:
         """Which of the labels a request is for."""
-        return request.label.removeprefix(f"{EASIEST} ")
+        wanted = request.label, request.place_on
+        return next(label for label, ask in self._asks.items() if (ask.label, ask.place_on) == wanted)
 
     def done(
         self,
@@ -323,6 +331,7 @@ class Order:
         *,
         touched: bool = False,
         held: bool = False,
+        by: str = "",
     ) -> Left | None:
         """Note what came of a request, and return what it leaves; None for nothing that was not left before.
 
@@ -333,7 +342,9 @@ class Order:
             placed: (x, y) where the object stands now, when it was placed.
             seen: (x, y) where it was seen last, when it was.
             touched: An arm has moved for it.
-            held: A hand may hold it still: it is put down before anything else; one that cannot do that ends the label.
+            held: A hand may hold it still: it is put down before anything else. An arm that cannot do that is left out;
+                the last one ends the label.
+            by: Arm that carried it out; "": none did.
         """
         label, after, arm = self.label_of(request), self._moved, request.arm
         if request in self.running:
@@ -344,13 +355,14 @@ class Order:
             return None
         self.left = [one for one in self.left if one.label != label or one.where is not None]
         where = None if seen is None else (float(seen[0]), float(seen[1]))
-        if code in _WITHOUT_ARM and request.phase == "all" and len(self._able) > 1 and arm in self._able:
-            self._stopped.add(arm)  # the other goes on
-            return self._leave(Left(label, where, code, f"{arm} arm: {message}", after)) if touched else None
         placing = request.phase == "place"
-        if placing:
-            self._held = self._held[1:]
-        elif held:
+        self._held = self._held[placing:]
+        mine = arm if arm in self.arms else by
+        if (code in _WITHOUT_ARM or (placing and held)) and mine in self._able and len(self._able) > 1:
+            self._stopped.add(mine)  # the other goes on; what a hand keeps was left before
+            left = Left(label, where, code, f"{mine} arm: {message}", after)
+            return self._leave(left) if touched and not placing else None
+        if held and not placing:
             self._held.append(label)
         if placing and code is Code.NOT_READY:
             return None  # no hand holds anything: it is where it was seen last

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import LONGEST_TEXT, brief, check_length
 from openarm_common.types import Array
+from openarm_common.wanted import EASIEST, SELECTIONS
 from openarm_grasp.config import LEAST_SCALE, DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict
 from openarm_grasp.perception.detections import Frame, Sighting, Spot, find
@@ -22,8 +23,8 @@ from openarm_grasp.requests.state_times import StateTime
 if TYPE_CHECKING:
     from openarm_grasp.planning.options import Option
 
-#: What to pick, and what to put it on or in.
-_ON = re.compile(r"(.*?)\s*\b(?:on|in):\s*(\S.*)", re.DOTALL)
+#: Words of a user: which of several, what, and what to put it on or in.
+_WORDS = re.compile(rf"\s*(?:(?:the\s+)?({EASIEST})\b)?(.*?)(?:\b(?:on|in):\s*(\S.*))?", re.DOTALL | re.IGNORECASE)
 #: These end a request, and one that runs at the same time; nothing else is tried.
 ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST, Code.STOPPED)
 #: What a request may ask for.
@@ -35,7 +36,8 @@ class GraspRequest:
     """A request of a user.
 
     Attributes:
-        label: Object to pick, in words; "" takes the first detection.
+        label: Object to pick: attributes of it, or words that `openarm_common.wanted` knows; "" fits any.
+        selection: Which of those that fit is taken, of `openarm_common.wanted.SELECTIONS`.
         arm: "auto", "left" or "right".
         place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
         dry_run: Plan and report, do not move.
@@ -51,7 +53,7 @@ class GraspRequest:
         place_choices: (x, y) of which a free one is chosen without a `place`, base frame, m; none: anywhere.
         why: Purpose, when it is a part of another request.
         same: The object, when an earlier part of the request was about it: as it was seen or left then.
-        place_on: Object that it is to stand on or in, in words; "": the table.
+        place_on: Object that it is to stand on or in, as `label`; "": the table.
     """
 
     label: str
@@ -70,18 +72,14 @@ class GraspRequest:
     why: str = ""
     same: Sighting | None = None
     place_on: str = ""
+    selection: str = ""
 
     @classmethod
     def of(cls, words: str, **fields: Any) -> GraspRequest:
-        """Return the request for words such as `red`, `red on:blue box` or `red in:tray`."""
-        found = _ON.fullmatch(words)
-        label, place_on = found.groups() if found else (words, "")
-        return cls(label, place_on=place_on, **fields)
-
-    @property
-    def words(self) -> str:
-        """What `of` reads: the label, and what to put it on."""
-        return f"{self.label} on:{self.place_on}" if self.place_on else self.label
+        """Return the request for words of a user such as `red`, `easiest can`, `red on:blue box` or `red in:tray`."""
+        found = _WORDS.fullmatch(words)
+        easiest, label, place_on = found.groups(default="") if found else ("", words, "")
+        return cls(label.strip(), **{"selection": EASIEST if easiest else "", "place_on": place_on} | fields)
 
     def about(self, same: Sighting) -> GraspRequest:
         """The request, for this object alone; it may have moved since."""
@@ -97,6 +95,7 @@ class GraspRequest:
             frames,
             self.label,
             limits,
+            selection=self.selection,
             at=self.object_at,
             exclude_near=self.exclude_near,
             exclude_parts=self.exclude_parts,
@@ -109,7 +108,7 @@ class GraspRequest:
         return replace(self, label=label, arm=arm, phase=phase)
 
     def check(self, arms: Collection[str]) -> None:
-        """Refuse an arm, a phase or a speed that does not exist, and a long text.
+        """Refuse an arm, a selection, a phase or a speed that does not exist, and a long text.
 
         Args:
             arms: Arms of the robot.
@@ -117,11 +116,14 @@ class GraspRequest:
         Raises:
             OpenArmError: INVALID_ARGUMENT.
         """
-        for name in ("label", "arm", "phase", "place_on"):
+        for name in ("label", "selection", "arm", "phase", "place_on"):
             check_length(getattr(self, name), name)
         check_arm(self.arm, arms)
         if self.place_on and self.place is not None:
             text = f"two places: on:{self.place_on} and {brief(str(self.place))}; give one"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
+        if self.selection not in SELECTIONS:
+            text = f"selection {self.selection!r} does not exist; valid: {', '.join(SELECTIONS[1:])}, or none"
             raise OpenArmError(Code.INVALID_ARGUMENT, text)
         if self.phase not in PHASES:
             raise OpenArmError(
@@ -137,7 +139,8 @@ def command(request: GraspRequest) -> str:
 
     Objects that stay where they are are left out: the command line has no words for them.
     """
-    words = ["openarm", "pick", *([request.label] if request.label else [])]
+    asked = " ".join(filter(None, (EASIEST if request.selection == EASIEST else "", request.label)))
+    words = ["openarm", "pick", *([asked] if asked else [])]
     options: dict[str, Sequence[object] | None] = {
         "--arm": None if request.arm == "auto" else (request.arm,),
         "--at": request.object_at,

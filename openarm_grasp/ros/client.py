@@ -6,21 +6,21 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from openarm_interfaces.action import Pick, PickTwo
-from openarm_interfaces.msg import GraspStatus, PickRequest, PickResult
+from openarm_interfaces.msg import GraspStatus, PickResult
 from openarm_interfaces.srv import ConfirmPlan, ReleaseHand
 from std_srvs.srv import Trigger
 
 from openarm_common.errors import Answer, Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
-from openarm_common.ros.convert import point, xyz
+from openarm_common.ros.convert import xyz
 from openarm_grasp.planning.options import Option
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.state_times import StateTime
-from openarm_grasp.ros.messages import code_from_text, option_from_msg
+from openarm_grasp.ros.messages import code_from_text, fill_request, option_from_msg
 
 OnFeedback = Callable[[GraspStatus], None]
 OnPlan = Callable[[GraspStatus], bool]
@@ -123,7 +123,8 @@ class GraspClient(BackgroundNode):
         """Pick an object and place it; returns when that has ended, well or not.
 
         Args:
-            label: Object to pick, in words; "" takes the detection with the highest score.
+            label: Object to pick, in words, such as "red can", or "red on:blue box"; "" takes the detection with the
+                highest score.
             arm: "auto", "left" or "right".
             place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
                 chosen.
@@ -149,17 +150,32 @@ class GraspClient(BackgroundNode):
             OpenArmError: NOT_READY, when no grasp node answers; TIMEOUT; INVALID_ARGUMENT, for a place that is not two
                 or three numbers.
         """
-        goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit, velocity_scale=speed)
-        asked = GraspRequest(
+        asked = GraspRequest.of(
             label,
+            arm=arm,
             place=None if place is None else tuple(place),
             place_yaw=place_yaw,
             object_at=None if object_at is None else tuple(object_at),
             exclude_near=tuple((p[0], p[1]) for p in exclude_near),
             place_choices=tuple((p[0], p[1]) for p in place_choices),
+            phase=phase,
+            dry_run=dry_run,
+            timeout=time_limit,
+            velocity_scale=speed,
         )
-        _where(goal, asked)
-        goal.confirm = bool(confirm)
+        return self.carry_out(asked, confirm=confirm, timeout=timeout, on_feedback=on_feedback)
+
+    def carry_out(
+        self,
+        asked: GraspRequest,
+        *,
+        confirm: OnPlan | bool = False,
+        timeout: float = 300.0,
+        on_feedback: OnFeedback | None = None,
+    ) -> GraspResult:
+        """Carry out a request; the other arguments, the result and the errors are those of `pick`."""
+        goal = Pick.Goal()
+        fill_request(goal, replace(asked, confirm=bool(confirm)))
         return _result(self._ask(Pick, "/grasp/pick", goal, timeout, on_feedback, confirm))
 
     def confirm(self, plan_id: str, *, accept: bool) -> Answer:
@@ -193,7 +209,8 @@ class GraspClient(BackgroundNode):
         """Pick two objects and place them, with both arms at the same time where planning allows that.
 
         Args:
-            first: A label, or a request with label, arm, place, place_yaw, object_at, exclude_near and place_choices.
+            first: Words for an object, or a request, of which `dry_run`, `confirm`, `phase`, `timeout` and
+                `velocity_scale` are not read.
             second: Another.
             dry_run: Plan and report, do not move.
             time_limit: s of robot time for both; then they end with TIMEOUT, hands keeping what they hold. 0: none.
@@ -210,9 +227,7 @@ class GraspClient(BackgroundNode):
         """
         goal = PickTwo.Goal(dry_run=dry_run, timeout=time_limit, velocity_scale=speed)
         for request, wanted in zip(goal.requests, (first, second), strict=True):
-            asked = GraspRequest(wanted) if isinstance(wanted, str) else wanted
-            request.label, request.arm = asked.words, asked.arm
-            _where(request, asked)
+            fill_request(request, GraspRequest.of(wanted) if isinstance(wanted, str) else wanted)
         answer: PickTwo.Result = self._ask(PickTwo, "/grasp/pick_two", goal, timeout, on_feedback)
         results = tuple(_result(one) for one in answer.results)
         return PairResult(**_same(answer, "simultaneous", "recording"), results=results)
@@ -256,22 +271,6 @@ class GraspClient(BackgroundNode):
 def _answer(message: ConfirmPlan.Response | ReleaseHand.Response) -> Answer:
     code = Code.OK if message.success else code_from_text(message.code, Code.INTERNAL)
     return Answer(message.success, code, message.message)
-
-
-def _where(message: Pick.Goal | PickRequest, asked: GraspRequest) -> None:
-    """Fill in where an object stands and where it should be placed."""
-    if asked.place_yaw is not None:
-        message.has_place_yaw, message.place_yaw = True, asked.place_yaw
-    if (place := asked.place) is not None:
-        if len(place) not in (2, 3):
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"place {list(place)} must be x, y or x, y, z in metres")
-        message.has_place_position = True
-        message.place_position = point((place[0], place[1], place[2] if len(place) == 3 else 0.0))
-    if (at := asked.object_at) is not None:
-        message.has_object_position, message.object_position = True, point((at[0], at[1], 0.0))
-    message.exclude_near, message.place_choices = (
-        [point((x, y, 0.0)) for x, y in spots] for spots in (asked.exclude_near, asked.place_choices)
-    )
 
 
 def _result(message: Pick.Result | PickResult) -> GraspResult:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -45,36 +45,52 @@ PLAN = "plan/"
 
 
 # --- requests and answers
-def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
-    """The request of a user; a service request and an action goal have the same fields."""
-    return replace(
-        _request(message),
-        dry_run=message.dry_run,
-        confirm=message.confirm,
-        phase=message.phase or "all",
-        timeout=message.timeout,
-        velocity_scale=message.velocity_scale,
+#: Fields of a request that have the same name in each message, and those of requests that are made alone.
+_SAME, _ALONE = ("arm", "selection", "place_on"), ("dry_run", "confirm", "phase", "timeout", "velocity_scale")
+
+
+def request_from_msg(message: Grasp.Request | Pick.Goal | PickRequest, **alone: Any) -> GraspRequest:
+    """The request of a user, whose words are read here; a service request and an action goal have the same fields."""
+    p, at = message.place_position, message.object_position
+    names = _SAME if isinstance(message, PickRequest) else (*_SAME, *_ALONE)
+    given = {name: getattr(message, name) for name in names if getattr(message, name) != ""}
+    return GraspRequest.of(
+        message.label,
+        **given,
+        **alone,
+        place=(p.x, p.y, p.z) if message.has_place_position else None,
+        place_yaw=message.place_yaw if message.has_place_yaw else None,
+        object_at=(at.x, at.y) if message.has_object_position else None,
+        exclude_near=tuple((p.x, p.y) for p in message.exclude_near),
+        place_choices=tuple((p.x, p.y) for p in message.place_choices),
     )
 
 
 def requests_from_msg(goal: PickTwo.Goal) -> tuple[GraspRequest, GraspRequest]:
     """Two requests at once."""
     run = {"dry_run": goal.dry_run, "timeout": goal.timeout, "velocity_scale": goal.velocity_scale}
-    first, second = (replace(_request(item), **run) for item in goal.requests)
+    first, second = (request_from_msg(item, **run) for item in goal.requests)
     return first, second
 
 
-def _request(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
-    """What all of them have in common."""
-    p, at = message.place_position, message.object_position
-    return GraspRequest.of(
-        message.label,
-        arm=message.arm or "auto",
-        place=(p.x, p.y, p.z) if message.has_place_position else None,
-        place_yaw=message.place_yaw if message.has_place_yaw else None,
-        object_at=(at.x, at.y) if message.has_object_position else None,
-        exclude_near=tuple((p.x, p.y) for p in message.exclude_near),
-        place_choices=tuple((p.x, p.y) for p in message.place_choices),
+def fill_request(message: Pick.Goal | PickRequest, asked: GraspRequest) -> None:
+    """Write a request into an action goal, or into one of its requests.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a place that is not two or three numbers.
+    """
+    for name in ("label", *_SAME, *(() if isinstance(message, PickRequest) else _ALONE)):
+        setattr(message, name, getattr(asked, name))
+    if asked.place_yaw is not None:
+        message.has_place_yaw, message.place_yaw = True, asked.place_yaw
+    if (place := asked.place) is not None:
+        if len(place) not in (2, 3):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"place {list(place)} must be x, y or x, y, z in metres")
+        message.has_place_position, message.place_position = True, point((*place, 0.0)[:3])
+    if (at := asked.object_at) is not None:
+        message.has_object_position, message.object_position = True, point((at[0], at[1], 0.0))
+    message.exclude_near, message.place_choices = (
+        [point((x, y, 0.0)) for x, y in spots] for spots in (asked.exclude_near, asked.place_choices)
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from openarm_common.detection import Detection, gap
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.hand import HandParts
-from openarm_common.wanted import EASIEST, EASY, describe
+from openarm_common.wanted import EASIEST, EASIEST_LEFT, EASIEST_RIGHT, describe
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import (
     NEXT_TO,
@@ -192,10 +192,9 @@ def _beside_others(run: Run) -> GraspRequest:
     """
     request, shoulders = run.task.session.excluding_others(run, run.request), run.context.shoulders
     side = sides(request.arm, shoulders) if request.arm in shoulders else ()
-    if len(side) != 1 or not request.label.startswith(EASIEST):
+    if len(side) != 1 or request.selection != EASIEST:
         return request
-    outermost = f"{'leftmost' if side[0] > 0.0 else 'rightmost'} {EASY}"
-    return replace(request, label=request.label.replace(EASIEST, outermost, 1))
+    return replace(request, selection=EASIEST_LEFT if side[0] > 0.0 else EASIEST_RIGHT)
 
 
 def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ...]:

@@ -40,7 +40,7 @@ async def push(task: Task) -> GraspOutcome | None:
     if refused is None or task.findings.place_refused:
         return None
     found = task.findings.need_sighting()
-    if _easiest(task) and crowded(found) and not found.target.kind:
+    if task.request.selection == EASIEST and crowded(found) and not found.target.kind:
         return None  # others may be taken first, after which it may stand alone
     avoid: list[Array] = []
     for number in range(1, task.context.config.push.most + 1):
@@ -70,10 +70,6 @@ async def push(task: Task) -> GraspOutcome | None:
     return refused
 
 
-def _easiest(task: Task) -> bool:
-    return EASIEST in task.request.label.casefold().split()
-
-
 def _may_sweep(task: Task, found: Sighting) -> bool:
     """Whether the object may be pushed with what the hand meets there; what comes of it is not known beforehand.
 
@@ -81,7 +77,7 @@ def _may_sweep(task: Task, found: Sighting) -> bool:
     For the easiest object nothing else is moved, and what fits into no hand is pushed in phase aside alone.
     """
     code = None if task.outcome is None else task.outcome.code
-    if task.request.dry_run or _easiest(task) or code is Code.TOO_WIDE:
+    if task.request.dry_run or task.request.selection == EASIEST or code is Code.TOO_WIDE:
         return False
     return crowded(found) or (code is Code.IN_COLLISION and cornered(found))
 

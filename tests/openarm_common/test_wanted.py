@@ -119,9 +119,11 @@ def test_the_easiest_lies_under_nothing_and_has_room() -> None:
     beside = thing("green", "box", 0.30, 0.06)
     alone = thing("", "box", 0.20, 0.3)
     hidden = replace(thing("white", "box", 0.2, -0.3), measured=False)
-    assert select("easiest anything", (hidden, under, beside, over, alone)) == (over, alone, beside, under, hidden)
-    assert select("easiest largest thing", (under, over))[0] is over
-    assert select("leftmost easy thing", (beside, over, alone, under)) == (alone, over, beside, under)
+    in_view = (hidden, under, beside, over, alone)
+    assert select("easiest anything", in_view) == select("", in_view, "easiest") == (over, alone, beside, under, hidden)
+    assert select("largest thing", (under, over), "easiest")[0] is over
+    assert select("thing", (beside, over, alone, under), "easiest_left") == (alone, over, beside, under)
+    assert select("thing", (beside, over, alone, under), "easiest_right")[-1] is under
     assert select("easiest red", (under, over)) == (under,)
 
 

@@ -162,10 +162,36 @@ def test_a_hand_that_cannot_let_go_ends_the_order(order):
     assert order.faults()[-1] == "anything: PLACE_FAILED: no free spot"
 
 
+@pytest.mark.requirement("P-21")
+def test_a_hand_that_cannot_let_go_does_not_stop_the_other_arm() -> None:
+    crew = Crew(Order(("anything",), arms=ARMS), dict(ROW), left=(-9.0, 9.0), right=(-9.0, 9.0))
+    crew.begin()
+    full, other = crew.order.running
+    crew.at.pop(id(full))
+    crew.order.done(full, Code.PLACE_FAILED, "the hand keeps it", seen=(0.3, 0.3), touched=True, held=True, by="left")
+    del crew.objects["a"]
+    crew.end(other)
+    placing = crew.order.next()
+    assert (placing.phase, placing.arm) == ("place", "auto")
+    assert crew.order.done(placing, Code.PLACE_FAILED, "no free spot", touched=True, held=True, by="left") is None
+    crew.work()
+    assert [arm for arm, _ in crew.taken] == ["right"] * 5
+    assert crew.order.faults() == ("anything at (0.300, 0.300) m: PLACE_FAILED: the hand keeps it",)
+
+
+def test_words_are_read_once_and_requests_have_fields() -> None:
+    order = Order(("easiest red in: tray", "largest can"))
+    first = order.next()
+    assert (first.label, first.selection, first.place_on) == ("red", "easiest", "tray")
+    assert order.label_of(first) == "easiest red in: tray"
+    order.done(first, Code.UNKNOWN_OBJECT, "none")
+    assert order.next().label == "largest can"
+
+
 def test_what_was_let_go_elsewhere_is_asked_for_again(order):
     order.done(order.next(), Code.GRASP_LOST, "it has turned", seen=(0.3, 0.0), touched=True, held=True)
     order.done(order.next(), Code.PLACE_FAILED, "let go where it met something", seen=(0.2, 0.1), touched=True)
-    assert peek(order) == GraspRequest("easiest anything", exclude_near=((0.3, 0.0), (0.2, 0.1)))
+    assert peek(order) == GraspRequest("anything", selection="easiest", exclude_near=((0.3, 0.0), (0.2, 0.1)))
 
 
 def test_a_camera_that_shows_nothing_is_asked_again_three_times_at_most():
@@ -236,7 +262,7 @@ def test_a_full_bin_is_the_reason_for_what_is_left():
     order.done(order.next(), Code.PLACE_FAILED, "none of 2 places is free", seen=(0.3, 0.1, 0.42))
     last = order.next()
     assert last == GraspRequest(
-        "easiest red", exclude_near=((0.2, 0.2), (0.3, 0.1)), place_choices=BINS.bins["left"].slots(BINS.spacing)
+        "red", selection="easiest", exclude_near=((0.2, 0.2), (0.3, 0.1)), place_choices=BINS.bins["left"].slots(BINS.spacing)
     )
     order.done(last, Code.UNKNOWN_OBJECT, "no more")
     assert order.next() is None
@@ -256,9 +282,9 @@ def test_orders_and_bins_that_make_no_sense_are_refused(tmp_path):
 def test_what_others_block_is_asked_for_again_when_they_are_gone():
     order = Order(("red", "blue"), each=1)
     order.done(order.next(), Code.IN_COLLISION, "blue is in the way")
-    assert peek(order) == GraspRequest("easiest blue")
+    assert peek(order) == GraspRequest("blue", selection="easiest")
     order.done(order.next(), Code.OK, "")
-    assert peek(order) == GraspRequest("easiest red")
+    assert peek(order) == GraspRequest("red", selection="easiest")
     order.done(order.next(), Code.OK, "")
     assert order.next() is None
     assert order.outcome == "SUCCESS"
@@ -275,7 +301,7 @@ def test_what_stays_blocked_failed_with_its_reason():
 def test_what_an_order_has_placed_it_does_not_pick_again():
     order = Order(("red",), each={"red": 2})
     order.done(order.next(), Code.OK, "", (0.3, -0.2, 0.4))
-    assert peek(order) == GraspRequest("easiest red", exclude_near=((0.3, -0.2),))
+    assert peek(order) == GraspRequest("red", selection="easiest", exclude_near=((0.3, -0.2),))
     order.done(order.next(), Code.OK, "", (0.2, -0.2, 0.4))
     assert order.next() is None
     assert order.outcome == "SUCCESS"
@@ -285,7 +311,7 @@ def test_what_an_order_has_placed_it_does_not_pick_again():
 def test_what_was_placed_is_not_asked_for_again_by_another_word():
     order = Order(("cola", "can"), each=1)
     order.done(order.next(), Code.OK, "", (0.3, 0.2, 0.4))
-    assert peek(order) == GraspRequest("easiest can", exclude_near=((0.3, 0.2),))
+    assert peek(order) == GraspRequest("can", selection="easiest", exclude_near=((0.3, 0.2),))
 
 
 @pytest.mark.requirement("R-17")
@@ -363,7 +389,7 @@ def test_what_a_push_has_moved_out_of_sight_does_not_end_an_order(order):
     ask = order.next()
     assert ask.object_at == (0.2, 0.1)
     order.done(ask, Code.UNKNOWN_OBJECT, "not there after the push", touched=True)
-    assert peek(order) == GraspRequest("easiest anything")
+    assert peek(order) == GraspRequest("anything", selection="easiest")
 
 
 @pytest.mark.requirement("R-17")
@@ -374,7 +400,7 @@ def test_what_is_not_at_its_place_may_be_a_part_of_something_that_is_seen_whole_
     ask = order.next()
     assert ask.object_at == (0.43, 0.06)
     order.done(ask, Code.UNKNOWN_OBJECT, "it is seen at (0.36, 0.07)")
-    assert peek(order) == GraspRequest("easiest anything")
+    assert peek(order) == GraspRequest("anything", selection="easiest")
     while ask := order.next():
         asked += 1
         assert asked < 10
@@ -550,7 +576,7 @@ def test_what_one_arm_sees_nothing_besides_is_not_looked_for_by_the_other_again(
 def test_no_more_objects_are_asked_for_at_once_than_are_wanted() -> None:
     order = Order(("red", "blue"), BINS, each=1, arms=ARMS)
     first, second = order.next(), order.next()
-    assert [ask.label for ask in (first, second)] == ["easiest red", "easiest blue"]
+    assert [ask.label for ask in (first, second)] == ["red", "blue"]
     assert first.place_choices == BINS.bins["left"].slots(BINS.spacing)
     assert second.place_choices == BINS.bins["right"].slots(BINS.spacing)[::-1]  # of one bin, from its other end
     order.done(first, Code.OK, "", placed=(0.2, 0.1))

@@ -135,19 +135,25 @@ def test_spots_that_something_hides_come_last():
 
 
 @pytest.mark.parametrize(
-    ("words", "label", "place_on"),
+    ("words", "selection", "label", "place_on"),
     [
-        ("red on:blue box", "red", "blue box"),
-        ("red cube left of the can in: tray", "red cube left of the can", "tray"),
-        ("on:tray", "", "tray"),
-        ("pylon: red", "pylon: red", ""),
-        ("red", "red", ""),
+        ("red on:blue box", "", "red", "blue box"),
+        ("red cube left of the can in: tray", "", "red cube left of the can", "tray"),
+        ("on:tray", "", "", "tray"),
+        ("pylon: red", "", "pylon: red", ""),
+        ("red", "", "red", ""),
+        ("Easiest red IN:tray", "easiest", "red", "tray"),
+        ("the easiest", "easiest", "", ""),
+        ("the easiestred", "", "the easiestred", ""),
     ],
 )
-def test_words_say_what_to_put_an_object_on(words: str, label: str, place_on: str):
+def test_words_of_a_user_become_fields(words: str, selection: str, label: str, place_on: str):
     request = GraspRequest.of(words, arm="left")
-    assert (request.label, request.place_on, request.arm) == (label, place_on, "left")
-    assert GraspRequest.of(request.words).place_on == place_on
+    assert request == GraspRequest(label, "left", selection=selection, place_on=place_on)
+
+
+def test_a_selection_that_does_not_exist_is_refused():
+    assert "easiest, " in refused("'ugliest' does not exist", GraspRequest("red", selection="ugliest").check, ()).message
 
 
 def test_two_places_are_refused():

@@ -122,7 +122,7 @@ def test_what_has_no_room_is_pushed_out_of_its_crowd_and_picked(pressed) -> None
 
 @pytest.mark.requirement("R-17")
 def test_the_easiest_object_is_not_pushed_for(pressed) -> None:
-    outcome = pressed.ask("easiest red")
+    outcome = pressed.ask("red", selection="easiest")
     assert (outcome.kind, outcome.code) == ("REFUSED", Code.IN_COLLISION)
     assert not pressed.done(Follow)
 
