@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from openarm_grasp.planning.options import Option
     from openarm_grasp.requests.request import GraspRequest
     from openarm_grasp.requests.state_times import StateTime
-    from openarm_grasp.ros.client import GraspClient, GraspResult, PairResult
+    from openarm_grasp.ros.client import GraspResult, PairResult
 
 
 T = TypeVar("T")

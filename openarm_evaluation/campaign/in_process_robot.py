@@ -14,9 +14,10 @@ from openarm_common.types import Array
 from openarm_control.gripper import GripperGoal, GripperOutcome
 from openarm_evaluation.campaign.robot import SimRobot
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box as GraspBox
 from openarm_grasp.planning.options import NoWayError, Refusal
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, check_deadline, slowed
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace, check_deadline, slowed
 from openarm_grasp.robot.interface import Trajectory as AnyTrajectory
 from openarm_motion.collision.solids import Box
 from openarm_motion.planning.approach import ApproachRequest, Target
@@ -46,7 +47,6 @@ class InProcessRobot:
     def __init__(self, robot: SimRobot, config: GraspConfig) -> None:
         self.robot = robot
         self.description, self.states = robot.description, robot.states
-        self.base_frame = robot.description.root
         self.together = robot.together
         self._config = config
         self.cancelled = ""
@@ -118,7 +118,7 @@ class InProcessRobot:
                 raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
             await self.robot.pause()
 
-    async def observe(self, count: int, *, near: str = "") -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> tuple[Frame, ...]:
         """Frames that are taken from now on.
 
         Raises:
@@ -130,7 +130,7 @@ class InProcessRobot:
         robot.frames.clear()
         limit = config.near.timeout if near else config.detect.frame_timeout
 
-        def fresh() -> list[Any]:
+        def fresh() -> list[Frame]:
             return [frame for frame in robot.frames if frame.t_ns >= since_ns]
 
         try:
@@ -140,7 +140,7 @@ class InProcessRobot:
                 raise
             seen = f"{len(fresh())} of {count} frames came within {limit:g} s"
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
-        return Frames(tuple(fresh()[-count:]), self.base_frame)
+        return tuple(fresh()[-count:])
 
     def expect_near(self, camera: str) -> None:
         """Nothing to wake: images are rendered when they are asked for."""

@@ -122,7 +122,7 @@ async def agree(
     show(f"plan {shown.id!r} is confirmed; seeing that nothing has changed", None)
     fault = await outdated(robot, [plan for _, plan in plans], before, task.context.config.confirm.joints)
     if not fault and standing:
-        frames = (await robot.observe_in_base(task.context.config.detect.frames)).frames
+        frames = await robot.look(task.context.config.detect.frames)
         fault = changed(standing, frames, task.context.config.held.moved, task.context.table.top_z)
     return f"plan {shown.id!r} is not executed: {fault}; planning again" if fault else ""
 

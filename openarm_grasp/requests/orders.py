@@ -153,8 +153,7 @@ class Order:
     moves any more, or when all that moves does so in vain.
 
     Attributes:
-        labels: Words of a user for objects, in this order; each is asked for until none is left, as often as `each` says
-            at most.
+        labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
         bins: Bins that they go into; None: to free spots.
         each: Most objects of one label, or of each label; 0: all.
         arms: Arms that work at the same time; fewer than two: one request at a time.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import inf
 from typing import Any, TypeVar, cast
 
@@ -21,9 +21,10 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.planning.options import NoWayError
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 from openarm_grasp.robot.skills import Skills
 
 T = TypeVar("T")
@@ -49,7 +50,7 @@ class ArmCoordination:
     planned: dict[str, Array] = field(default_factory=dict[str, Array])
     waiting: set[str] = field(default_factory=set[str])
     observing: str = ""
-    seen: dict[str, Frames] = field(default_factory=dict[str, Frames])
+    seen: dict[str, tuple[Frame, ...]] = field(default_factory=dict[str, tuple[Frame, ...]])
     sent_home: str = ""
 
     @contextmanager
@@ -103,7 +104,7 @@ class CoordinatedRobot:
         self._robot.warn(f"{self.arm} arm: {text}")
 
     # --- observing
-    async def observe(self, count: int, *, near: str = "") -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> tuple[Frame, ...]:
         """Frames that are taken from now on; for a request that begins, those with which the arm's last one ended.
 
         What the other arm hides may not be needed. An arm that observes from home again without a motion in between
@@ -113,10 +114,10 @@ class CoordinatedRobot:
         coordination.planned.pop(self.arm, None)
         begins, self._begun = not self._begun, True
         again, self._observed = self._observed, self._observed or not near
-        known = coordination.seen.get(self.arm, Frames((), "")).frames[-count:]
+        known = coordination.seen.get(self.arm, ())[-count:]
         recent = len(known) == count and robot.now_ns - known[-1].t_ns <= self._config.detect.max_age * 1e9
         if begins and not near and recent:
-            return replace(coordination.seen[self.arm], frames=known)
+            return known
         if again and not near and self._is_home(self.arm):
             await robot.until(self._other_is_away, limit, f"observing: the {self._other} arm is in the view")
         await robot.until(lambda: coordination.observing in ("", self.arm), limit, "observing: the other arm observes")

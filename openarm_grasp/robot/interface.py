@@ -67,14 +67,6 @@ class PlanPlace:
 
 
 @dataclass(frozen=True)
-class Frames:
-    """Frames of detections, oldest first, and the frame they are expressed in."""
-
-    frames: tuple[Frame, ...]
-    frame_id: str
-
-
-@dataclass(frozen=True)
 class Planned:
     """A plan: which of the offered ways was chosen, and its three trajectories.
 
@@ -113,11 +105,6 @@ class RobotInterface(Protocol):
     @property
     def states(self) -> RobotStateBuffer:
         """Its joint states."""
-        ...
-
-    @property
-    def base_frame(self) -> str:
-        """Name of the base frame."""
         ...
 
     deadline_ns: int
@@ -163,8 +150,8 @@ class RobotInterface(Protocol):
     async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
         """Carry out several coroutines at once; all end before this does, then the first error is raised."""
 
-    async def observe(self, count: int, *, near: str = "") -> Frames:
-        """Frames of detections that are taken from now on, by the camera over the table, or by one on a hand."""
+    async def observe(self, count: int, *, near: str = "") -> tuple[Frame, ...]:
+        """Frames that are taken from now on, oldest first, by the camera over the table, or by one on a hand."""
         ...
 
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:

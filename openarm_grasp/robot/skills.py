@@ -21,7 +21,7 @@ from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
 from openarm_grasp.evidence.verdicts import Evidence, learn_command
-from openarm_grasp.perception.detections import Frame, Sighting, in_base
+from openarm_grasp.perception.detections import Frame, Sighting
 from openarm_grasp.planning.candidates import (
     UP,
     Box,
@@ -33,7 +33,7 @@ from openarm_grasp.planning.candidates import (
 )
 from openarm_grasp.planning.neighbours import neighbours, under
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory, slowed
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory, slowed
 
 #: The map shows an object so much wider than it is, m.
 _CELL = 0.01
@@ -102,8 +102,8 @@ class Skills:
         await robot.until(lambda: robot.now_ns >= end_ns, limit, f"waiting {duration:g} s of robot time")
 
     # --- observing
-    async def observe(self, count: int, *, near: str = "") -> Frames:
-        """Frames of detections that are taken from now on, by the camera over the table, or by one on a hand."""
+    async def observe(self, count: int, *, near: str = "") -> tuple[Frame, ...]:
+        """Frames that are taken from now on, oldest first, by the camera over the table, or by one on a hand."""
         self.robot.check()
         return await self.robot.observe(count, near=near)
 
@@ -115,19 +115,11 @@ class Skills:
         """Let the detector rest."""
         self.robot.stop_observing()
 
-    def in_base(self, seen: Frames) -> Frames:
-        """Frames of detections in the base frame, at the joints of their stamps."""
-        self.robot.check()
-        base, states = self.robot.base_frame, self.robot.states
-        if seen.frame_id == base:
-            return seen
-        return Frames(in_base(seen.frames, lambda t_ns: states.lookup(base, seen.frame_id, t_ns)), base)
-
-    async def observe_in_base(self, count: int) -> Frames:
-        """So many frames of the camera over the table, in the base frame; the detector rests afterwards."""
+    async def look(self, count: int) -> tuple[Frame, ...]:
+        """So many frames of the camera over the table; the detector rests afterwards."""
         seen = await self.observe(count)
         self.stop_observing()
-        return self.in_base(seen)
+        return seen
 
     async def towards_end(
         self,
@@ -169,7 +161,7 @@ class Skills:
         frames = list[Frame]()
 
         async def look() -> None:
-            frames.extend((await self.observe(count)).frames)
+            frames.extend(await self.observe(count))
 
         await self.towards_end(motion, near_end, look)
         return tuple(frames)

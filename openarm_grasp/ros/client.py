@@ -14,7 +14,7 @@ from openarm_interfaces.msg import GraspStatus, PickResult
 from openarm_interfaces.srv import ConfirmPlan, ReleaseHand
 from std_srvs.srv import Trigger
 
-from openarm_common.errors import Answer, Code, OpenArmError
+from openarm_common.errors import Answer, Code
 from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import xyz
 from openarm_grasp.planning.options import Option

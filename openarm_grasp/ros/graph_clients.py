@@ -35,7 +35,6 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import Silence
 from openarm_grasp.perception.boxes import with_points
 from openarm_grasp.perception.detections import Frame, Ids, in_base
-from openarm_grasp.robot.interface import Frames
 from openarm_grasp.ros.pad_listener import Pads
 
 #: What the detector of the camera over the table finds.
@@ -229,7 +228,9 @@ class GraphClients:
         return answer.result
 
     # --- observing
-    async def observe(self, count: int, topic: str, camera: str, limit: float, guard: Callable[[], None]) -> Frames:
+    async def observe(
+        self, count: int, topic: str, camera: str, limit: float, guard: Callable[[], None]
+    ) -> tuple[Frame, ...]:
         """Collect frames of detections that are taken from now on, in the base frame.
 
         Args:
@@ -255,7 +256,7 @@ class GraphClients:
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
         base = self._node.description.base
         frames = in_base(self._frames[-count:], lambda t_ns: self.robot.buffer.lookup(base, self._frame_id, t_ns))
-        return Frames(tuple(self._with_cloud(self._ids[topic].given(frame), camera) for frame in frames), base)
+        return tuple(self._with_cloud(self._ids[topic].given(frame), camera) for frame in frames)
 
     def listen(self, topic: str) -> None:
         """Let a detector begin: the first frame comes up to 1.5 s later, as its camera rests without a subscriber."""

@@ -22,8 +22,9 @@ from openarm_common.ros.holds import Holder
 from openarm_common.ros.node import BaseNode
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, Trajectory, check_deadline, slowed
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace, Trajectory, check_deadline, slowed
 from openarm_grasp.ros import messages
 from openarm_grasp.ros.graph_clients import DETECTIONS, GraphClients
 
@@ -131,11 +132,6 @@ class GraphRobot:
         return self._nodes.robot.buffer
 
     @property
-    def base_frame(self) -> str:
-        """Name of the base frame."""
-        return self._node.description.base
-
-    @property
     def now_ns(self) -> int:
         """Robot time; 0 before the first joint state."""
         return self._nodes.now_ns
@@ -207,7 +203,7 @@ class GraphRobot:
         if faults:  # an emergency stop ends all, and only an arm's controller can say that it was one
             raise next((f for f in faults if isinstance(f, OpenArmError) and f.code is Code.STOPPED), faults[0])
 
-    async def observe(self, count: int, *, near: str = "") -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> tuple[Frame, ...]:
         """Frames of detections that are taken from now on."""
         if not near:
             config, watched = self._config, self._watched(None)
@@ -238,7 +234,7 @@ class GraphRobot:
         if not self._ik.service_is_ready():
             return {}
         answer = await self._answer(
-            self._ik, messages.reach_request(arm, self.base_frame, T_base_tcp), "/motion/compute_ik"
+            self._ik, messages.reach_request(arm, self.description.base, T_base_tcp), "/motion/compute_ik"
         )
         return messages.reach_from_msg(arm, answer, T_base_tcp)
 
@@ -268,7 +264,7 @@ class GraphRobot:
         self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = (), *, plan_only: bool = False
     ) -> None:
         """Ask /motion/move."""
-        goal = messages.move_goal(arm, self.base_frame, to, obstacles, self.velocity_scale, self.max_start_delay)
+        goal = messages.move_goal(arm, self.description.base, to, obstacles, self.velocity_scale, self.max_start_delay)
         goal.plan_only = plan_only
         await self._moved(arm, self._move, goal, what)
 

@@ -36,7 +36,7 @@ from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import Grasp
-from openarm_grasp.robot.interface import Frames, Planned
+from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import reraise_stop
 from openarm_grasp.sampling.slabs import EASED, eased
 
@@ -100,7 +100,7 @@ async def detect(run: Run, why: str) -> Sighting:
         run.enter(State.DETECT, why)
         await _clear_view(run)
         seen = await run.robot.observe(run.config.detect.frames)
-        text = f"in view: {describe([d for frame in seen.frames for d in frame.detections])}"
+        text = f"in view: {describe([d for frame in seen for d in frame.detections])}"
         if run.kept is not None:
             text = f"holding {run.label!r}; {text}"
         elif missing := _missing(run, seen):
@@ -115,7 +115,7 @@ async def detect(run: Run, why: str) -> Sighting:
         run.enter(State.TRANSFORM, text)
         run.robot.stop_observing()
         try:
-            return _locate(run, run.robot.in_base(seen).frames)
+            return _locate(run, seen)
         except OpenArmError as error:
             if error.code not in _NOT_TRUSTED:
                 raise
@@ -123,10 +123,10 @@ async def detect(run: Run, why: str) -> Sighting:
             run.forget()
 
 
-def _missing(run: Run, seen: Frames) -> OpenArmError | None:
+def _missing(run: Run, seen: Sequence[Frame]) -> OpenArmError | None:
     """Why nothing in view is what is asked for; None when something is."""
     try:
-        in_view(run.robot.in_base(seen).frames, run.request.label)
+        in_view(seen, run.request.label)
     except OpenArmError as error:
         return error if error.code in (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT) else None
     return None

@@ -131,7 +131,7 @@ async def _observe(session: GraspSession, robot: Skills, request: GraspRequest) 
     robot.set_speed(request.velocity_scale)
     if not request.dry_run:
         await robot.go_home(robot.description.arm_names, back_off_below=session.context.clear_of_objects)
-    return (await robot.observe_in_base(session.context.config.detect.frames)).frames
+    return await robot.look(session.context.config.detect.frames)
 
 
 def _both(requests: Requests, frames: Sequence[Frame], limits: DetectConfig) -> tuple[Sighting, Sighting]:

@@ -133,7 +133,7 @@ async def _attempts(run: Run) -> GraspOutcome:
 async def _see_where_it_is(run: Run) -> None:
     """Note where an object is that an arm has moved in vain; what is not seen is where it was seen last."""
     with suppress(OpenArmError):  # what went wrong with the arm says more
-        frames = (await run.robot.observe_in_base(run.config.detect.frames)).frames
+        frames = await run.robot.look(run.config.detect.frames)
         run.seen_at = run.request.find(frames, run.config.detect).target.p_base
 
 
@@ -180,7 +180,7 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
         grasp, plan, why = await _correct(run, grasp, plan, camera)
     run.enter(State.MOVE_TO_GRASP, why)
     target = grasp.sighting.target
-    still, why = judge_unmoved(first_points(grasp.sighting), (await robot.observe(1)).frames)
+    still, why = judge_unmoved(first_points(grasp.sighting), await robot.observe(1))
     if not still and run.suspected is not None and apart(target, run.suspected) < config.detect.agree_within:
         still, why = True, f"{why}; so it seemed before, and it had not: the hand hides a part of it"
     run.suspected = target

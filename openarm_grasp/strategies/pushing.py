@@ -178,7 +178,7 @@ async def carry_out_push(
     if fault is not None:
         raise OpenArmError(fault.code, f"push {number}: {fault.message}")
     try:
-        frames = (await robot.observe_in_base(config.detect.frames)).frames
+        frames = await robot.look(config.detect.frames)
     except OpenArmError as error:
         text = f"push {number}: {found.target.label!r} was not seen since: {error.message}"
         raise OpenArmError(error.code, text) from error

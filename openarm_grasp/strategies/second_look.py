@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,6 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.perception.detections import Frame, Sighting, apart, find, on_table, picked
 from openarm_grasp.planning import retries
-from openarm_grasp.robot.interface import Frames
 from openarm_grasp.robot.skills import reraise_stop
 from openarm_grasp.sampling.samplers import refine
 
@@ -50,7 +50,7 @@ async def second_look(run: Run, grasp: Grasp, camera: str, least: float) -> tupl
     return (None, text) if size < least else (again, text)
 
 
-def _seen_again(run: Run, grasp: Grasp, seen: Frames) -> Grasp:
+def _seen_again(run: Run, grasp: Grasp, seen: Sequence[Frame]) -> Grasp:
     """The grasp of the object as the camera on the hand sees it whose hand is turned most like the chosen one's.
 
     Raises:
@@ -70,7 +70,7 @@ def _seen_again(run: Run, grasp: Grasp, seen: Frames) -> Grasp:
     return replace(grasp, sighting=sighting, candidate=retries.most_like(grasp.candidate, offered))
 
 
-def _shape_again(run: Run, grasp: Grasp, seen: Frames) -> Grasp:
+def _shape_again(run: Run, grasp: Grasp, seen: Sequence[Frame]) -> Grasp:
     """The grasp next to the chosen one on the surface that the camera over the table and that on the hand have seen.
 
     Raises:
@@ -85,7 +85,7 @@ def _shape_again(run: Run, grasp: Grasp, seen: Frames) -> Grasp:
     return replace(grasp, candidate=replace(refined[0], id=grasp.candidate.id))
 
 
-def _found(run: Run, grasp: Grasp, seen: Frames) -> Sighting:
+def _found(run: Run, grasp: Grasp, seen: Sequence[Frame]) -> Sighting:
     """The object among the detections of the camera on the hand.
 
     Raises:
@@ -93,7 +93,7 @@ def _found(run: Run, grasp: Grasp, seen: Frames) -> Sighting:
     """
     before, config = grasp.sighting.target, run.config
     frames: list[Frame] = []
-    for frame in seen.frames:
+    for frame in seen:
         near = [d for d in frame.detections if d.label == before.label and apart(d, before) <= config.near.largest]
         frames.append(picked(frame, near))
     return find(frames, before.label, config.detect)

@@ -55,7 +55,7 @@ async def verify(run: Run, grasp: Grasp, placed: Placed, frames: Sequence[Frame]
             break
         run.enter(State.RESET, f"{run.label!r} is not in view after the place; observing again")
         try:
-            frames = (await robot.observe(config.detect.frames)).frames
+            frames = await robot.observe(config.detect.frames)
         except OpenArmError as error:
             reraise_stop(error)
             raise OpenArmError(Code.PLACE_FAILED, f"put down, but not seen since: {error.message}") from error

@@ -34,12 +34,13 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.boxes import with_points
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.requests.task import GraspSession, Status
 from openarm_grasp.requests.task import Task as GraspTask
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, check_deadline
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace, check_deadline
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.registry import carry_out
 from tests.openarm_grasp.tape import Call, Tape, packed, unpacked
@@ -50,17 +51,17 @@ _SAME = 1e-4
 _MOST = 0.9
 
 
-def _with_points(robot: Any, seen: Frames, camera: str) -> Frames:
+def _with_points(robot: Any, seen: Sequence[Frame], camera: str) -> tuple[Frame, ...]:
     """Frames that have no points with those of their boxes."""
-    made, mounted = list(seen.frames), load_cameras()[camera]
+    made, mounted = list(seen), load_cameras()[camera]
     robot_filter = SelfFilter(robot.description, SelfFilterConfig())
     for k, frame in enumerate(made):
         if frame.cloud is None:
-            T = robot.states.lookup(robot.base_frame, mounted.parent, frame.t_ns) @ mounted.T_parent_optical
+            T = robot.states.lookup(robot.description.root, mounted.parent, frame.t_ns) @ mounted.T_parent_optical
             shapes = robot_filter.shapes(robot.states.latest()[1])
             outline = robot_filter.outline(mounted.intrinsics, T, shapes)
             made[k] = with_points(frame, mounted.intrinsics, T, 0.4, outline)
-    return replace(seen, frames=tuple(made))
+    return tuple(made)
 
 
 def _asked(request: PlanGrasp | PlanPlace) -> tuple[list[Any], np.ndarray]:
@@ -150,11 +151,11 @@ class SimulatedRobot(InProcessRobot):
     def held_box(self, arm: str) -> Box | None:
         return self._end(self._begin("held_box", arm), super().held_box(arm))
 
-    async def observe(self, count: int, *, near: str = "") -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> tuple[Frame, ...]:
         call = self._begin("observe", count, near)
         seen = await self._ask(call, super().observe(count, near=near))
         if not self._clouds:
-            seen = replace(seen, frames=tuple(replace(frame, cloud=None) for frame in seen.frames))
+            seen = tuple(replace(frame, cloud=None) for frame in seen)
         arrays: list[np.ndarray] = []  # the strategy gets what will be read
         kept = packed(seen, arrays)
         kept = self._end(call, unpacked(kept, {f"array{k}": array for k, array in enumerate(arrays)}))
@@ -213,7 +214,6 @@ class RecordedRobot:
         self.tape, self._config = tape, config
         self.description = RobotDescription.load()
         self.states = RobotStateBuffer(self.description)
-        self.base_frame = self.description.root
         self.deadline_ns, self.velocity_scale, self.cancelled = 0, 0.0, ""
         self.watch: Callable[[], None] = lambda: None
         self._tick, self._calls = -1, 0
@@ -328,7 +328,7 @@ class RecordedRobot:
                 raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
             await turn()
 
-    async def observe(self, count: int, *, near: str = "") -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> tuple[Frame, ...]:
         seen = await self._answer(self._next("observe", count, near))
         return _with_points(self, seen, near or self._config.camera)
 

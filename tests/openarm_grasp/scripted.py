@@ -28,7 +28,7 @@ from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import GraspSession, Status, Task
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.registry import carry_out
@@ -89,16 +89,11 @@ class Observe:
 
 
 @dataclass(frozen=True)
-class ToBase:
-    pass
-
-
-@dataclass(frozen=True)
 class Reach:
     arms: tuple[str, ...]
 
 
-Call = Follow | MoveLinear | GoHome | Grip | Measure | Wait | Observe | ToBase | Reach | PlanGrasp | PlanPlace
+Call = Follow | MoveLinear | GoHome | Grip | Measure | Wait | Observe | Reach | PlanGrasp | PlanPlace
 Fault = Callable[[Call], OpenArmError | None]
 
 
@@ -246,14 +241,14 @@ class World(Skills):
         self.call(Wait(duration))
         self.pass_time(duration)
 
-    async def observe(self, count: int, *, near: str = "") -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> tuple[Frame, ...]:
         self.call(Observe(count, near))
         seen = self.frames(count)
         if not near:
             return seen
         T_off = se3.make(p=(self.near_off, 0.0, 0.0))
-        shifted = (replace(d, T_base_object=T_off @ d.T_base_object) for d in seen.frames[-1].detections)
-        return Frames((frame_of(*shifted, t_ns=seen.frames[-1].t_ns),) * count, seen.frame_id)
+        shifted = (replace(d, T_base_object=T_off @ d.T_base_object) for d in seen[-1].detections)
+        return (frame_of(*shifted, t_ns=seen[-1].t_ns),) * count
 
     async def towards_end(
         self,
@@ -267,10 +262,6 @@ class World(Skills):
     async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
         for part in parts:
             await part()
-
-    def in_base(self, seen: Frames) -> Frames:
-        self.call(ToBase())
-        return seen
 
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         if isinstance(request, PlanGrasp) and "/push/" in request.candidates[0].id:
@@ -414,12 +405,12 @@ class World(Skills):
         way = self._line * (1.0 - gap / np.linalg.norm(self._line)) * self.follows
         self.objects["red"] = standing_at(self.objects["red"], self.objects["red"].p_base[:2] + way[:2])
 
-    def frames(self, count: int) -> Frames:
+    def frames(self, count: int) -> tuple[Frame, ...]:
         seen, found = frame_of(*(replace(d, id=name) for name, d in self.objects.items())), list[Frame]()
         for _ in range(count):
             self.pass_time(0.1)
             found.append(replace(seen, t_ns=self.t_ns - round(self.frame_age * 1e9)))
-        return Frames(tuple(found), "base")
+        return tuple(found)
 
     def pass_time(self, seconds: float) -> None:
         self.t_ns += round(seconds * 1e9)

@@ -19,7 +19,7 @@ from openarm_common.labelled_cloud import LabelledCloud
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box
-from openarm_grasp.robot.interface import Frames, Planned
+from openarm_grasp.robot.interface import Planned
 
 #: Points of clouds are kept in steps of this, m; the noise of depth is larger.
 _STEP = 5e-4
@@ -29,7 +29,7 @@ _FINE = 1e-6
 _TRUE = 1e-5
 #: Arrays of so few numbers stand in the text.
 _SMALL = 16
-_KINDS = {kind.__name__: kind for kind in (Detection, LabelledCloud, Frame, Frames, Planned, Verdict, Box)}
+_KINDS = {kind.__name__: kind for kind in (Detection, LabelledCloud, Frame, Planned, Verdict, Box)}
 
 
 @dataclass
@@ -155,6 +155,8 @@ def unpacked(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         return np.array(of[1], np.float64).reshape(of[0])
     if kind == "code":
         return Code(of)
+    if kind == "Frames":  # of recordings that were made with their frame
+        return unpacked(of["frames"], arrays)
     if kind == "map":
         return {key: unpacked(one, arrays) for key, one in of}
     if kind == "cloud":

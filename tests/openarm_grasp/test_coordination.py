@@ -14,7 +14,6 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.options import NoWayError, Refusal
 from openarm_grasp.robot.coordination import ArmCoordination, CoordinatedRobot
-from openarm_grasp.robot.interface import Frames
 from tests.refusals import refused
 
 
@@ -65,11 +64,11 @@ class Robot:
     def warn(self, text: str) -> None:
         self.warnings.append(text)
 
-    async def observe(self, count: int, *, near: str = "") -> Frames:
+    async def observe(self, count: int, *, near: str = "") -> tuple[Frame, ...]:
         self.looks += 1
         self.now_ns += count * 10**8
         stamps = (self.now_ns - k * 10**8 for k in reversed(range(count)))
-        return Frames(tuple(Frame(t_ns, ()) for t_ns in stamps), "base")
+        return tuple(Frame(t_ns, ()) for t_ns in stamps)
 
     def stop_observing(self) -> None:
         pass

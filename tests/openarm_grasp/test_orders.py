@@ -262,7 +262,10 @@ def test_a_full_bin_is_the_reason_for_what_is_left():
     order.done(order.next(), Code.PLACE_FAILED, "none of 2 places is free", seen=(0.3, 0.1, 0.42))
     last = order.next()
     assert last == GraspRequest(
-        "red", selection="easiest", exclude_near=((0.2, 0.2), (0.3, 0.1)), place_choices=BINS.bins["left"].slots(BINS.spacing)
+        "red",
+        selection="easiest",
+        exclude_near=((0.2, 0.2), (0.3, 0.1)),
+        place_choices=BINS.bins["left"].slots(BINS.spacing),
     )
     order.done(last, Code.UNKNOWN_OBJECT, "no more")
     assert order.next() is None

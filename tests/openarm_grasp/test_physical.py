@@ -129,7 +129,7 @@ def test_an_object_that_leans_by_15_degrees_is_not_taken_for_placed(
         world, tick = robot.trials.robot, robot.trials.robot.tick
 
     def observed() -> tuple[Frame, ...]:
-        return robot.link.run(robot.link.observe(2)).frames
+        return robot.link.run(robot.link.observe(2))
 
     def judged(frames: tuple[Frame, ...]) -> CameraVerdict:
         # Which part of it is the middle is not the question here.

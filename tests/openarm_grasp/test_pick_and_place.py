@@ -19,7 +19,7 @@ from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
 from openarm_motion.service.requests import ApproachAnswer, PlanApproachRequest
-from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Observe, ToBase
+from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Observe
 from tests.refusals import refused
 
 
@@ -221,7 +221,7 @@ def test_no_frames_end_the_grasp_at_once(world):
 
 @pytest.mark.requirement("B-33")
 def test_no_transform_means_no_motion(world):
-    world.fail(lambda e: isinstance(e, ToBase), Code.NO_TRANSFORM)
+    world.fail(lambda e: isinstance(e, Observe), Code.NO_TRANSFORM)
     world.ends(Code.NO_TRANSFORM)
     assert not world.done(Follow)
 

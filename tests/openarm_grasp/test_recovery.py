@@ -16,7 +16,7 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.sightings import standing_at
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.states import State
-from openarm_grasp.robot.interface import Frames, PlanGrasp, PlanPlace
+from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, frame_of
@@ -114,7 +114,7 @@ def test_a_placed_object_that_the_detector_misses_is_looked_for_again(world):
         if world.state is State.RESET and not missed:
             missed.append(count)
             world.pass_time(0.1 * count)
-            return Frames(tuple(frame_of(t_ns=world.t_ns) for _ in range(count)), "base")
+            return tuple(frame_of(t_ns=world.t_ns) for _ in range(count))
         return real(count)
 
     world.frames = frames
@@ -130,7 +130,7 @@ def test_an_alarm_that_the_look_from_home_does_not_confirm_is_raised_once(world,
         found = real(count)
         if world.state is not State.MOVE_TO_GRASP:
             return found
-        return Frames(tuple(frame_of(shifted, t_ns=frame.t_ns) for frame in found.frames), "base")
+        return tuple(frame_of(shifted, t_ns=frame.t_ns) for frame in found)
 
     world.frames = frames
     assert world.succeeds().attempts == 2
@@ -188,10 +188,10 @@ def test_a_placed_object_that_the_detector_misses_in_one_frame_is_placed(world, 
     real = world.frames
 
     def frames(count):
-        found = list(real(count).frames)
+        found = list(real(count))
         if world.state is State.RESET:
             found[missed] = frame_of(world.objects["blue"], t_ns=found[missed].t_ns)
-        return Frames(tuple(found), "base")
+        return tuple(found)
 
     world.frames = frames
     assert world.succeeds().attempts == 1
@@ -201,7 +201,7 @@ def test_a_placed_object_that_the_detector_misses_in_one_frame_is_placed(world, 
 @pytest.mark.parametrize("phase", ["pick", "all"])
 def test_a_camera_whose_place_is_not_known_says_nothing_and_nothing_is_said_to_be_done(world, phase):
     real = world.frames
-    world.frames = lambda count: Frames(tuple(replace(one, cloud=None) for one in real(count).frames), "base")
+    world.frames = lambda count: tuple(replace(one, cloud=None) for one in real(count))
     outcome = world.grasp(phase=phase)
     assert outcome.code is Code.STALE_DATA
     assert "nothing shows whether it has gone" in outcome.message or "no points of what stands" in outcome.message

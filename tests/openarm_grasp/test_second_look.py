@@ -16,8 +16,9 @@ from openarm_evaluation.campaign.robot import Known, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.requests.task import Status
-from openarm_grasp.robot.interface import Frames, PlanGrasp
+from openarm_grasp.robot.interface import PlanGrasp
 from tests.openarm_grasp.scripted import Follow
 
 pytestmark = pytest.mark.requirement("A-35")
@@ -71,14 +72,14 @@ def test_a_second_look_that_does_not_help_changes_nothing(what: str, worlds, box
     world = worlds(box("red", 0.26, -0.2), near={"enabled": True})
     real = world.observe
 
-    async def observe(count: int, *, near: str = "") -> Frames:
+    async def observe(count: int, *, near: str = "") -> tuple[Frame, ...]:
         seen = await real(count, near=near)
         if not near:
             return seen
         if what == "failed":
             raise OpenArmError(Code.NOT_READY, "no node publishes /wrist/detections_3d")
         found = {"nothing": (), "another": (box("red", 0.34, -0.2),), "no plan": (box("red", 0.27, -0.2),)}[what]
-        return Frames(tuple(replace(frame, detections=found) for frame in seen.frames), "base")
+        return tuple(replace(frame, detections=found) for frame in seen)
 
     world.observe = observe
     if what == "no plan":
@@ -94,11 +95,11 @@ def test_a_second_look_corrects_the_grasp_before_the_hand_goes_down(worlds, box)
     world = worlds(box("red", 0.26, -0.2), near={"enabled": True})
     real = world.observe
 
-    async def observe(count: int, *, near: str = "") -> Frames:
+    async def observe(count: int, *, near: str = "") -> tuple[Frame, ...]:
         seen = await real(count, near=near)
         if not near:
             return seen
-        return Frames(tuple(replace(frame, detections=(box("red", 0.27, -0.2),)) for frame in seen.frames), "base")
+        return tuple(replace(frame, detections=(box("red", 0.27, -0.2),)) for frame in seen)
 
     world.observe = observe
     world.succeeds()

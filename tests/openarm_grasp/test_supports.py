@@ -153,7 +153,9 @@ def test_words_of_a_user_become_fields(words: str, selection: str, label: str, p
 
 
 def test_a_selection_that_does_not_exist_is_refused():
-    assert "easiest, " in refused("'ugliest' does not exist", GraspRequest("red", selection="ugliest").check, ()).message
+    assert (
+        "easiest, " in refused("'ugliest' does not exist", GraspRequest("red", selection="ugliest").check, ()).message
+    )
 
 
 def test_two_places_are_refused():
