@@ -249,7 +249,8 @@ def order(
         speed: Share of the limits of the joints, as for `pick`.
         timeout: Longest wait for one object, s.
     """
-    from openarm_grasp.requests.orders import Order, load_bins
+    from openarm_grasp.requests.bins import load_bins
+    from openarm_grasp.requests.orders import Order
 
     join_graph(domain)
     from openarm_common.robot.description import RobotDescription

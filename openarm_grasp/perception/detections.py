@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import count, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,8 @@ _MOST = 0.95
 _STACKED = 0.005
 #: An object of no known shape that has fewer points has no cloud.
 _LEAST_POINTS = 60
+#: What has been out of view for so long, ns, has another id when it is seen again.
+_FORGET_NS = 60_000_000_000
 
 
 @dataclass(frozen=True)
@@ -97,18 +99,20 @@ class Ids:
     """Ids for detections of a detector that follows nothing: that of the nearest one of its label before."""
 
     def __init__(self) -> None:
-        self._known: dict[str, Detection] = {}
+        self._known: dict[str, tuple[int, Detection]] = {}
+        self._numbers = count()
 
     def given(self, frame: Frame) -> Frame:
         """Return a frame with an id for each detection; one that its detector has given stays."""
-        free, named = dict(self._known), list[Detection]()
+        self._known = {name: one for name, one in self._known.items() if abs(frame.t_ns - one[0]) <= _FORGET_NS}
+        free, named = {name: known for name, (_, known) in self._known.items()}, list[Detection]()
         for d in frame.detections:
             alike = [name for name, known in free.items() if known.label == d.label and apart(d, known) <= NEXT_TO]
-            name = d.id or min(alike, key=lambda name: apart(d, free[name]), default=f"~{len(self._known)}")
+            name = d.id or min(alike, key=lambda name: apart(d, free[name]), default="") or f"~{next(self._numbers)}"
             free.pop(name, None)
             named.append(d if d.id else replace(d, id=name))
             if not d.id:
-                self._known[name] = named[-1]
+                self._known[name] = frame.t_ns, d
         return replace(frame, detections=tuple(named))
 
 

@@ -53,7 +53,6 @@ class PlanPlace:
         held: Boxes of what the hand carries, TCP frame.
         after: Trajectory whose end is the start; None starts at the present joints.
         ignore_regions: Regions that the object has left: the map may still show it there.
-        velocity_scale: Share of the speed of other motions.
     """
 
     arm: str
@@ -62,7 +61,7 @@ class PlanPlace:
     held: tuple[Box, ...]
     after: Trajectory | None = None
     ignore_regions: tuple[Box, ...] = ()
-    velocity_scale: float = 1.0
+    velocity_scale: ClassVar[float] = 1.0
     blend: ClassVar[bool] = True
 
 

@@ -64,7 +64,7 @@ class GraphClients:
         self._node = node
         self._config = config
         self.table_z = table_z
-        self._outline = SelfFilter(node.description, SelfFilterConfig())
+        self._outline, self._cameras = SelfFilter(node.description, SelfFilterConfig()), load_cameras()
         self.robot = RobotStateListener(node, node.description, joints=False, held_topic="/motion/attached_objects")
         self.pads = Pads(node)
         self._subscriptions: dict[str, tuple[Subscription, ...]] = {}
@@ -297,7 +297,7 @@ class GraphClients:
             if message is not None:
                 T = buffer.lookup(base, message.header.frame_id, frame.t_ns)
                 return replace(frame, cloud=labelled_cloud_from_msg(message).moved(T))
-            mounted = load_cameras().get(camera)
+            mounted = self._cameras.get(camera)
             if mounted is None or self.sees(_points_of(self._topic)):
                 return frame
             lens = mounted.intrinsics

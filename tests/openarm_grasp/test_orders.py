@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code
-from openarm_grasp.requests.orders import Bin, Bins, Order, load_bins
+from openarm_grasp.requests.bins import Bin, Bins, load_bins
+from openarm_grasp.requests.orders import Order
 from openarm_grasp.requests.request import GraspRequest
 from tests.refusals import refused
 
