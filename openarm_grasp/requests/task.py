@@ -267,7 +267,6 @@ class Status:
         attempt: 1-based number of the attempt, 0 when none runs.
         label: Label of the object, "" while none is known.
         arm: The arm in use, "" while none is chosen.
-        request: Number of the request among those that run at the same time, 0 or 1.
         failed: The attempt, or what was observed for it, has failed.
         candidates: Grasps that the planner chooses from; in PLAN and MOVE_TO_PREGRASP.
         chosen: Id of the one that was chosen, or "".
@@ -284,7 +283,6 @@ class Status:
     attempt: int = 0
     label: str = ""
     arm: str = ""
-    request: int = 0
     failed: bool = False
     candidates: tuple[GraspCandidate, ...] = ()
     chosen: str = ""
@@ -328,13 +326,10 @@ class Task:
         robot: Carries out.
         request: Request.
         report: Called at each state that is entered.
-        index: Number of the request among those that run at the same time, 0 or 1.
     """
 
-    def __init__(
-        self, session: GraspSession, robot: Skills, request: GraspRequest, report: Report, index: int = 0
-    ) -> None:
-        self.session, self.robot, self.request, self._report, self.index = session, robot, request, report, index
+    def __init__(self, session: GraspSession, robot: Skills, request: GraspRequest, report: Report) -> None:
+        self.session, self.robot, self.request, self._report = session, robot, request, report
         self.began_ns = robot.now_ns
         self.clock = StateClock(session.context.config.budget, self.began_ns)
         #: Physical attempts so far.
@@ -366,7 +361,7 @@ class Task:
     def note(self, reason: str, plan: ShownPlan | None = None) -> None:
         """Report what is done between two parts of the request, or a plan that waits there."""
         label, arm = self.request.label, plan.arm if plan else ""
-        self.report(Status(State.IDLE, State.IDLE, reason, label=label, arm=arm, request=self.index, plan=plan))
+        self.report(Status(State.IDLE, State.IDLE, reason, label=label, arm=arm, plan=plan))
 
     def may_go_on(self, outcome: GraspOutcome) -> bool:
         """Whether another strategy may try: planning has refused the object where it is, with any arm."""

@@ -71,7 +71,8 @@ class GraspNode(BaseNode[GraspConfig]):
         self._robot.follow_mounts(self._take_mounts)
         #: What each arm is at work on, for the answer to what comes meanwhile.
         self._coordination = ArmCoordination()
-        self._newest: dict[int, Status] = {}
+        #: The newest state of a request of each arm, and of one of all arms.
+        self._newest: dict[str, Status] = {}
         #: What a cancel of a goal reaches, by id of each goal that is carried out.
         self._cancels: dict[bytes, list[GraphRobot]] = {}
         self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
@@ -217,15 +218,15 @@ class GraspNode(BaseNode[GraspConfig]):
     async def _one(
         self, request: GraspRequest, on_status: OnStatus | None = None, goal: ServerGoalHandle | None = None
     ) -> GraspOutcome:
-        report, arm, robot = partial(self._publish, on_status=on_status), self._arm_of(request), self._robot
-        arms, index = (arm,) if arm else self._arms, self._arms.index(arm) if arm else 0
+        arm, arms, robot = self._arm_of(request), self._arms, self._robot
         if arm:
-            request, robot = replace(request, arm=arm), self._robot.next_to_other()
+            request, arms, robot = replace(request, arm=arm), (arm,), self._robot.next_to_other()
+        report = partial(self._publish, arm=arm, on_status=on_status)
 
         async def work() -> GraspOutcome:
             await self._learn_unknown(robot, arms, request)
             skills = coordinated(arm, robot, self._coordination, self.config) if arm else self._skills
-            return await carry_out(Task(self._session, skills, request, report, index))
+            return await carry_out(Task(self._session, skills, request, report))
 
         try:
             outcome = await self._take(
@@ -233,7 +234,7 @@ class GraspNode(BaseNode[GraspConfig]):
             )
         except OpenArmError as error:
             request = request.cut()
-            self._refused(f"grasp of {request.label!r}", error, index)
+            self._refused(f"grasp of {request.label!r}", error, arm)
             outcome = GraspOutcome(error.code, error.message, request.label)
         else:
             self._report(outcome)
@@ -253,7 +254,7 @@ class GraspNode(BaseNode[GraspConfig]):
             return self._one(request, on_status[i], goal)
 
         def note(reason: str) -> None:
-            self._publish(Status(State.IDLE, State.IDLE, reason), on_status[0])
+            self._publish(Status(State.IDLE, State.IDLE, reason), on_status=on_status[0])
 
         try:
             return await pick_two(self._session, self._skills, asked, with_all_arms, carry_out_one, note)
@@ -301,15 +302,16 @@ class GraspNode(BaseNode[GraspConfig]):
         if not (self._coordination.at_work or self._cancels):
             self._robot.end()
 
-    def _refused(self, what: str, error: OpenArmError, index: int = 0) -> None:
+    def _refused(self, what: str, error: OpenArmError, arm: str = "") -> None:
         self.get_logger().warning(f"{what} refused: {error}")
         if error.code is not Code.BUSY:  # what runs publishes its own state
-            self._publish(Status(State.IDLE, State.IDLE, error.message, code=error.code.value, request=index), None)
+            self._publish(Status(State.IDLE, State.IDLE, error.message, code=error.code.value), arm)
             self._diagnose(error.code is not Code.NOT_READY, f"{error.code}: {error.message}")
 
     # --- publishing
     def _diagnose(self, ok: bool, text: str, *, late: bool = False, **values: str) -> None:
-        values.setdefault("state", self._newest[0].state.value if 0 in self._newest else State.IDLE.value)
+        working = (one.state for one in self._newest.values() if one.state is not State.IDLE)
+        values.setdefault("state", next(working, State.IDLE).value)
         if ok and late:
             self.diagnose_warning(text, **values)
         else:
@@ -327,11 +329,11 @@ class GraspNode(BaseNode[GraspConfig]):
         text = f"{drift.message}; {report}" if drift.alarm else report
         self._diagnose(not drift.alarm, text, late=bool(late), drift=drift.message)
 
-    def _publish(self, status: Status, on_status: OnStatus | None) -> None:
-        """Publish a state that was entered."""
+    def _publish(self, status: Status, arm: str = "", on_status: OnStatus | None = None) -> None:
+        """Publish a state that was entered by a request of an arm, or of all."""
         t_ns = self._robot.now_ns
-        before = self._newest.get(status.request)
-        self._newest[status.request] = status
+        before = self._newest.get(arm)
+        self._newest[arm] = status
         message = messages.status_msg(status, self.description.base, t_ns)
         self._status_topic.publish(message)
         if on_status is not None:
@@ -339,7 +341,7 @@ class GraspNode(BaseNode[GraspConfig]):
         if status.state is State.IDLE:
             # The newest status is not that of one which has ended while the other is at work.
             for other in self._newest.values():
-                if other.request != status.request and other.state is not State.IDLE:
+                if other.state is not State.IDLE:
                     self._status_topic.publish(
                         messages.status_msg(replace(other, previous=other.state), self.description.base, t_ns)
                     )

@@ -87,7 +87,7 @@ class Run:
         check_transition(self.state, state)
         previous, self.state = self.state, state
         failed = self.failure is not None
-        status = Status(state, previous, reason, self.attempt, self.label, self.arm, self.task.index, failed, plan=plan)
+        status = Status(state, previous, reason, self.attempt, self.label, self.arm, failed, plan=plan)
         if state in (State.PLAN, State.MOVE_TO_PREGRASP):
             mine = (option for option in self.options.values() if option.arm == self.arm)
             refused = frozenset(option.id for option in mine if option.code not in ("", Code.OK))
@@ -167,9 +167,8 @@ class Run:
         """
         self.task.session.end(self, outcome)
         check_transition(self.state, State.IDLE)
-        text, task = outcome.message, self.task
-        about = Status(State.IDLE, self.state, text, label=outcome.label, arm=outcome.arm, request=task.index)
-        task.report(replace(about, code=outcome.code.value))
+        about = Status(State.IDLE, self.state, outcome.message, label=outcome.label, arm=outcome.arm)
+        self.task.report(replace(about, code=outcome.code.value))
         return outcome
 
     def answer(self, code: Code, message: str, proof: Proof | Feasible | None = None) -> GraspOutcome:
