@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 _WORDS = re.compile(rf"\s*(?:(?:the\s+)?({EASIEST})\b)?(.*?)(?:\b(?:on|in):\s*(\S.*))?", re.DOTALL | re.IGNORECASE)
 #: These end a request, and one that runs at the same time; nothing else is tried.
 ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST, Code.STOPPED)
+#: Fields of a request that are texts.
+_TEXTS = ("label", "selection", "arm", "phase", "place_on")
 #: What a request may ask for.
 PHASES = ("all", "pick", "place", "aside")
 
@@ -104,8 +106,7 @@ class GraspRequest:
 
     def cut(self) -> GraspRequest:
         """The request with its texts cut where they are too long to be accepted."""
-        label, arm, phase = (text[:LONGEST_TEXT] for text in (self.label, self.arm, self.phase))
-        return replace(self, label=label, arm=arm, phase=phase)
+        return replace(self, **{name: getattr(self, name)[:LONGEST_TEXT] for name in _TEXTS})
 
     def check(self, arms: Collection[str]) -> None:
         """Refuse an arm, a selection, a phase or a speed that does not exist, and a long text.
@@ -116,7 +117,7 @@ class GraspRequest:
         Raises:
             OpenArmError: INVALID_ARGUMENT.
         """
-        for name in ("label", "selection", "arm", "phase", "place_on"):
+        for name in _TEXTS:
             check_length(getattr(self, name), name)
         check_arm(self.arm, arms)
         if self.place_on and self.place is not None:

@@ -126,6 +126,10 @@ def test_an_approach_that_fails_carries_all_refusals(bench) -> None:
     goal = approach_goal(bench)
     goal.touchable = ["cup"]
     assert bench.run(bench.plan_client, goal).code == "INVALID_ARGUMENT"
+    goal = approach_goal(bench)
+    goal.targets, goal.touchable = goal.targets[1:], []
+    (refusal,) = bench.run(bench.plan_client, goal).refusals
+    assert (refusal.code, refusal.first.startswith("openarm_right_"), refusal.second) == ("IN_COLLISION", True, "cube")
 
 
 @pytest.mark.requirement("N-03")
