@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import nan
 
@@ -36,6 +37,17 @@ class NoWayError(OpenArmError):
     def __init__(self, code: Code, message: str, refusals: Mapping[str, Refusal]) -> None:
         super().__init__(code, message)
         self.refusals = refusals
+
+
+@contextmanager
+def refusals(faults: list[str], what: str = "") -> Generator[None, None, None]:
+    """Go on after what cannot be done, by one of `NO_WAY`; its message, after `what`, is added to the faults."""
+    try:
+        yield
+    except OpenArmError as error:
+        if error.code not in NO_WAY:
+            raise
+        faults.append(f"{what}{error.message}")
 
 
 #: Message of a way that was not evaluated, or not chosen.

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.perception.detections import Frame, apart
+from openarm_grasp.perception.detections import Frame, Sighting, apart
 
 if TYPE_CHECKING:
     from openarm_grasp.requests.task import Task
@@ -125,6 +125,17 @@ async def agree(
         frames = await robot.look(task.context.config.detect.frames)
         fault = changed(standing, frames, task.context.config.held.moved, task.context.table.top_z)
     return f"plan {shown.id!r} is not executed: {fault}; planning again" if fault else ""
+
+
+async def agree_once(task: Task, arm: str, text: str, names: Sequence[str], plan: Planned, found: Sighting) -> None:
+    """As `agree`, of one plan for what was found, which is not planned again.
+
+    Raises:
+        OpenArmError: STALE_DATA, when the scene has changed meanwhile; CANCELLED, when it is rejected.
+    """
+    changed = await agree(task, arm, text, [(names, plan)], task.note, (found.target, *found.others))
+    if changed:
+        raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning again')}; ask again")
 
 
 async def outdated(robot: Skills, plans: Sequence[Planned], start: Mapping[str, float], tolerance: float) -> str:

@@ -304,7 +304,7 @@ class Order:
         self.left = [one for one in self.left if one.label != label or one.where is not None]
         where = None if seen is None else (float(seen[0]), float(seen[1]))
         placing = request.phase == "place"
-        self._held = self._held[placing:]
+        self._held = self._held[1:] if placing else self._held
         mine = arm if arm in self.arms else by
         if (code in _WITHOUT_ARM or (placing and held)) and mine in self._able and len(self._able) > 1:
             self._stopped.add(mine)  # the other goes on; what a hand keeps was left before

@@ -13,11 +13,12 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.requests.confirm import PUSH, agree_once
 from openarm_grasp.requests.request import Feasible, GraspOutcome
 from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.find import detect
 from openarm_grasp.strategies.pick_and_place import succeeded
-from openarm_grasp.strategies.pushing import agree_to_push, carry_out_push, plan_sweep
+from openarm_grasp.strategies.pushing import carry_out_push, plan_sweep
 from openarm_grasp.strategies.run import Run
 
 
@@ -53,7 +54,7 @@ async def _pushed(run: Run, found: Sighting) -> GraspOutcome:
             raise OpenArmError(Code.PLACE_FAILED, f"{text}; then {error.message}") from error
         if run.request.dry_run:
             return run.answer(Code.OK, f"can be done: {planned}", Feasible(str(planned)))
-        await agree_to_push(task, planned, found)
+        await agree_once(task, planned.arm, str(planned), PUSH, planned.plan, found)
         run.arm = planned.arm
         pushed, text, hand, camera = await carry_out_push(task, planned, found, number)
         task.displaced = "after the pushes"

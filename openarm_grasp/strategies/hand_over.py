@@ -24,7 +24,7 @@ from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.perception.sightings import seen_at
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.feasibility import FeasibilityCheck
-from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.options import NO_WAY, refusals
 from openarm_grasp.planning.place import clear_spots, grid
 from openarm_grasp.requests.request import Feasible, GraspOutcome
 from openarm_grasp.requests.task import Task
@@ -133,12 +133,8 @@ async def plan_hand_over(task: Task, seen: Sighting) -> HandOver:
     spots = [task.context.on_table(xy) for xy in middle_spots(seen.target, seen.others, task.context)]
     shoulders, y, faults = task.context.shoulders, seen.target.p_base[1], list[str]()
     for giver, taker in sorted(permutations(shoulders, 2), key=lambda two: abs(shoulders[two[0]][1] - y)):
-        try:
+        with refusals(faults, f"{giver} to {taker}: "):
             return await _between(task, seen, giver, taker, spots)
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-            faults.append(f"{giver} to {taker}: {error.message}")
     raise OpenArmError(Code.NO_PLAN, f"no hand-over through the middle: {'; '.join(faults)}")
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.feasibility import FeasibilityCheck
-from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.requests.confirm import GRASP, agree
+from openarm_grasp.planning.options import NO_WAY, refusals
+from openarm_grasp.requests.confirm import GRASP, agree_once
 from openarm_grasp.requests.request import Feasible, GraspOutcome
 from openarm_grasp.requests.task import Task
 from openarm_grasp.robot.interface import Planned
@@ -54,26 +54,19 @@ async def height(task: Task) -> GraspOutcome | None:
         return None
     found, faults = task.findings.need_sighting(), list[str]()
     for position in heights(task):
-        try:
+        with refusals(faults, f"at {position:.3f} m: "):
             await task.robot.move_lift(position, plan_only=True)  # milliseconds, where a grasp takes seconds
             planned = await _planned(task, found, position)
             if task.request.dry_run:
                 return replace(refused, code=Code.OK, message=f"can be done: {planned}", proof=Feasible(str(planned)))
-            standing = (found.target, *found.others)
-            parts = [(GRASP, planned.plan)]
-            if changed := await agree(task, planned.arm, str(planned), parts, task.note, standing):
-                raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning again')}; ask again")
+            await agree_once(task, planned.arm, str(planned), GRASP, planned.plan, found)
             task.note(str(planned))
             await task.robot.move_lift(position)
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-            faults.append(f"at {position:.3f} m: {error.message}")
-            continue
-        outcome = await pick_and_place(task, replace(task.request.about(found), why=f"the lift is at {position:.3f} m"))
-        if not task.may_go_on(outcome):
-            return outcome
-        faults.append(f"at {position:.3f} m: {outcome.message}")
+            why = f"the lift is at {position:.3f} m"
+            outcome = await pick_and_place(task, replace(task.request.about(found), why=why))
+            if not task.may_go_on(outcome):
+                return outcome
+            faults.append(f"at {position:.3f} m: {outcome.message}")
     why = faults[0] if faults else "it has no other height"
     text = f"nor can it at another height of the lift ({len(faults)} tried): {why}"
     raise OpenArmError(refused.code, text)

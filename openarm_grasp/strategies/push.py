@@ -26,12 +26,13 @@ from openarm_grasp.planning.candidates import GraspCandidate, displaced, target_
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.planning.neighbours import cornered, crowded
 from openarm_grasp.planning.offers import offers
-from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.options import NO_WAY, refusals
 from openarm_grasp.planning.pushes import closed_hand, destinations, push_ways
+from openarm_grasp.requests.confirm import PUSH, agree_once
 from openarm_grasp.requests.request import Feasible, GraspOutcome
 from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.pushing import Push, agree_to_push, carry_out_push, is_open, plan_sweep
+from openarm_grasp.strategies.pushing import Push, carry_out_push, is_open, plan_sweep
 
 
 async def push(task: Task) -> GraspOutcome | None:
@@ -55,7 +56,7 @@ async def push(task: Task) -> GraspOutcome | None:
             return replace(refused, message=f"{refused.message}; after {number - 1} pushes {error.message}")
         if task.request.dry_run:
             return replace(refused, code=Code.OK, message=f"can be done: {planned}", proof=Feasible(str(planned)))
-        await agree_to_push(task, planned, found)
+        await agree_once(task, planned.arm, str(planned), PUSH, planned.plan, found)
         try:
             pushed, observed, *_ = await carry_out_push(task, planned, found, number)
         except OpenArmError as error:
@@ -119,12 +120,8 @@ async def plan_push(task: Task, found: Sighting, avoid: Sequence[Array]) -> Push
     ways = _ways_alone(task.context, found) if ends else {}
     for end in ends:
         x, y = end
-        try:
+        with refusals(faults, f"to ({x:.3f}, {y:.3f}) m: "):
             return await _push_to(task, found, end, await _taker(task, found, end, ways))
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-            faults.append(f"to ({x:.3f}, {y:.3f}) m: {error.message}")
     why = f"{faults[0]} ({len(faults) - 1} other pushes refused)" if faults else "there is no free place around it"
     raise OpenArmError(Code.UNREACHABLE, f"it cannot be pushed into reach either: {why}")
 
@@ -138,16 +135,12 @@ def _ways_alone(context: GraspContext, found: Sighting) -> Mapping[str, tuple[Gr
     clouds = (replace(c, points=c.points[c.labels != 2], labels=c.labels[c.labels != 2]) for c in found.clouds)
     alone = replace(found, others=(), clouds=tuple(clouds))
     ways: dict[str, tuple[GraspCandidate, ...]] = {}
-    fault = ""
+    faults = list[str]()
     for arm in context.shoulders:
-        try:
+        with refusals(faults):
             ways[arm] = offers(context, arm, alone)
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-            fault = error.message
     if not ways:
-        raise OpenArmError(Code.UNREACHABLE, f"a push would not help either: {fault}")
+        raise OpenArmError(Code.UNREACHABLE, f"a push would not help either: {faults[-1]}")
     return ways
 
 
@@ -172,12 +165,7 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
         if not ways:
             faults.append(f"{arm} hand: {found.target.label!r} is too thin for it, or would tip over")
             continue
-        try:
+        with refusals(faults):
             plan = await robot.plan_push(arm, ways, found, target_boxes(found.target, ways[0], config))
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-            faults.append(error.message)
-            continue
-        return Push(arm, found.target.p_base[:2], end, ways[plan.chosen], plan, "into reach")
+            return Push(arm, found.target.p_base[:2], end, ways[plan.chosen], plan, "into reach")
     raise OpenArmError(Code.UNREACHABLE, f"no hand comes behind it: {'; '.join(faults)}")

@@ -21,9 +21,8 @@ from openarm_grasp.evidence.verdicts import CameraVerdict, HandVerdict, judge_pa
 from openarm_grasp.perception.detections import Sighting, apart
 from openarm_grasp.perception.sightings import first_points, seen_at
 from openarm_grasp.planning.candidates import GraspCandidate
-from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.options import refusals
 from openarm_grasp.planning.pushes import closed_hand, direction, push_ways, sweeps
-from openarm_grasp.requests.confirm import PUSH, agree
 from openarm_grasp.requests.task import Task
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
@@ -103,14 +102,9 @@ async def plan_sweep(
             if not ways:
                 faults.append(f"{arm} hand: what stands there is too thin for it")
                 continue
-            try:
+            with refusals(faults):
                 plan = await robot.plan_push(arm, ways, replace(found, others=sweep.rest), sweep.heap, sweep.under)
-            except OpenArmError as error:
-                if error.code not in NO_WAY:
-                    raise
-                faults.append(error.message)
-                continue
-            return Push(arm, start, sweep.freed, ways[plan.chosen], plan, "through what is near it")
+                return Push(arm, start, sweep.freed, ways[plan.chosen], plan, "through what is near it")
     why = f"{faults[0]} ({len(faults) - 1} other lines refused)" if faults else "there is no room around it"
     raise OpenArmError(Code.UNREACHABLE, f"no line pushes it out of what is near it: {why}")
 
@@ -118,18 +112,6 @@ async def plan_sweep(
 def is_open(way: Array, avoid: Sequence[Array]) -> bool:
     """Whether a way (2,) leads elsewhere than directions to avoid."""
     return all(float(direction(way) @ one) < _SAME_WAY for one in avoid)
-
-
-async def agree_to_push(task: Task, planned: Push, found: Sighting) -> None:
-    """Let a person confirm a push, where that is asked for.
-
-    Raises:
-        OpenArmError: STALE_DATA, when the scene has changed meanwhile; CANCELLED, when it is rejected.
-    """
-    standing = (found.target, *found.others)
-    changed = await agree(task, planned.arm, str(planned), [(PUSH, planned.plan)], task.note, standing)
-    if changed:
-        raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning again')}; ask again")
 
 
 async def carry_out_push(
