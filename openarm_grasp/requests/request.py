@@ -81,7 +81,8 @@ class GraspRequest:
         """Return the request for words of a user such as `red`, `easiest can`, `red on:blue box` or `red in:tray`."""
         found = _WORDS.fullmatch(words)
         easiest, label, place_on = found.groups(default="") if found else ("", words, "")
-        return cls(label.strip(), **{"selection": EASIEST if easiest else "", "place_on": place_on} | fields)
+        read: dict[str, Any] = {"selection": EASIEST if easiest else "", "place_on": place_on}
+        return cls(label.strip(), **read | fields)
 
     def about(self, same: Sighting) -> GraspRequest:
         """The request, for this object alone; it may have moved since."""

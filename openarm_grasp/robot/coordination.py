@@ -39,19 +39,19 @@ class ArmCoordination:
 
     Attributes:
         at_work: Work of each arm, by arm; others rest.
-        planned: Joints (n,) at which each arm plans, or has planned, what it may not have begun yet, rad by arm.
         waiting: Arms that wait until the other goes on.
         observing: The arm that observes; "" when none does.
         seen: Newest frames of the camera over the table, by the arm that observed.
         sent_home: The arm at rest that the other sends home; "" when none is.
+        planned: Joints (n,) at which each arm plans, or has planned, what it may not have begun yet, rad by arm.
     """
 
     at_work: dict[str, str] = field(default_factory=dict[str, str])
-    planned: dict[str, Array] = field(default_factory=dict[str, Array])
     waiting: set[str] = field(default_factory=set[str])
     observing: str = ""
     seen: dict[str, tuple[Frame, ...]] = field(default_factory=dict[str, tuple[Frame, ...]])
     sent_home: str = ""
+    planned: dict[str, Array] = field(default_factory=dict[str, Array])
 
     @contextmanager
     def taking(self, arms: Sequence[str], what: str) -> Generator[None, None, None]:
@@ -141,7 +141,12 @@ class CoordinatedRobot:
     # --- planning and moving
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Plan; again when the other arm has gone on."""
-        return await self._patiently(lambda: self._in_turn(lambda: self._robot.plan(request)), "planning")
+
+        async def work() -> Planned:
+            return await self._robot.plan(request)
+
+        later = isinstance(request, PlanPlace) and request.after is not None
+        return await self._patiently(work if later else lambda: self._in_turn(work), "planning")
 
     async def follow(
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None

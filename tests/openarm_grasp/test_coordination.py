@@ -14,6 +14,7 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.options import NoWayError, Refusal
 from openarm_grasp.robot.coordination import ArmCoordination, CoordinatedRobot
+from openarm_grasp.robot.interface import PlanPlace
 from tests.refusals import refused
 
 
@@ -128,6 +129,10 @@ def test_an_arm_plans_when_the_other_has_begun_what_it_has_planned() -> None:
     robot.on_step = lambda step: robot.away("right", 0.05) if step == 3 else None
     run(left.plan(None))  # type: ignore[arg-type]
     assert robot.steps == 3
+    del coordination.planned["left"]
+    run(left.plan(PlanPlace("left", (), (), (), after="lift")))  # of what comes after another motion
+    assert not {"left"} & {*coordination.planned}
+    run(left.plan(None))  # type: ignore[arg-type]
     run(right.observe(3))  # which has begun, and plans anew
     robot.on_step = lambda step: coordination.planned.pop("left") if step == 5 else None
     run(right.plan(None))  # type: ignore[arg-type]

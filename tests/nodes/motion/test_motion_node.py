@@ -127,7 +127,7 @@ def test_an_approach_that_fails_carries_all_refusals(bench) -> None:
     goal.touchable = ["cup"]
     assert bench.run(bench.plan_client, goal).code == "INVALID_ARGUMENT"
     goal = approach_goal(bench)
-    goal.targets, goal.touchable = goal.targets[1:], []
+    goal.targets, goal.touchable, goal.obstacles[0].size.y = goal.targets[1:], [], 0.2
     (refusal,) = bench.run(bench.plan_client, goal).refusals
     assert (refusal.code, refusal.first.startswith("openarm_right_"), refusal.second) == ("IN_COLLISION", True, "cube")
 
