@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from math import inf
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -184,13 +183,17 @@ class CoordinatedRobot:
 
     # --- the other arm
     async def _in_turn(self, work: Callable[[], Awaitable[T]]) -> T:
-        """Plan when the other arm has begun what it has planned."""
-        planned = self._coordination.planned
+        """Plan when the other arm has begun what it has planned, or has rested as long as it may."""
+        planned, limit = self._coordination.planned, self._config.limits.beside_wait
 
         def begun() -> bool:
             return self._other not in planned or self._has_turned(planned[self._other], _BEGUN)
 
-        await self._robot.until(begun, inf, f"the {self._other} arm is about to move")
+        try:
+            await self._robot.until(begun, limit, f"the {self._other} arm is about to move")
+        except OpenArmError as error:
+            if error.code is not Code.TIMEOUT:
+                raise
         planned[self.arm] = self._pose(self.arm)
         return await work()
 

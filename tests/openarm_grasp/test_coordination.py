@@ -137,6 +137,8 @@ def test_an_arm_plans_when_the_other_has_begun_what_it_has_planned() -> None:
     robot.on_step = lambda step: coordination.planned.pop("left") if step == 5 else None
     run(right.plan(None))  # type: ignore[arg-type]
     assert robot.steps == 5
+    run(left.plan(None))  # type: ignore[arg-type]  # of one that does not begin at all
+    assert robot.steps == 25
 
 
 def test_a_plan_in_vain_and_the_end_of_a_request_let_the_other_arm_plan() -> None:
