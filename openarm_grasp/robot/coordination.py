@@ -42,7 +42,7 @@ class ArmCoordination:
         observing: The arm that observes; "" when none does.
         seen: Newest frames of the camera over the table, by the arm that observed.
         sent_home: The arm at rest that the other sends home; "" when none is.
-        planned: Joints (n,) at which each arm plans, or has planned, what it may not have begun yet, rad by arm.
+        planned: Joints (n,) at which each arm plans, or has planned, what it may not follow yet, rad by arm.
     """
 
     at_work: dict[str, str] = field(default_factory=dict[str, str])
@@ -167,8 +167,7 @@ class CoordinatedRobot:
         if arm != self._other:
             self._observed = False
             await self._robot.until(lambda: coordination.sent_home != arm, self._config.limits.beside_timeout, what)
-            await self._patiently(lambda: self._in_turn(work), what)
-            coordination.planned.pop(arm, None)
+            await self._patiently(work, what)
             return
         if arm in coordination.at_work:
             return
