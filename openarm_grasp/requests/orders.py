@@ -110,6 +110,7 @@ class Order:
         left: Objects that could not be taken.
         failed: Labels that could not be asked for, or were never there, and why.
         running: Requests that are being carried out.
+        over: The robot cannot go on.
     """
 
     labels: Sequence[str]
@@ -120,6 +121,7 @@ class Order:
     left: list[Left] = field(default_factory=list[Left])
     failed: dict[str, str] = field(default_factory=dict[str, str])
     running: list[GraspRequest] = field(default_factory=list[GraspRequest])
+    over: bool = False
     #: What is asked for, by label, and the labels of whatever there is.
     _asks: dict[str, GraspRequest] = field(default_factory=dict[str, GraspRequest])
     _any: set[str] = field(default_factory=set[str])
@@ -318,7 +320,7 @@ class Order:
             self._place(label, placed, seen, placing=placing)
             return None
         if (placing and held) or code in (*_OVER, Code.INVALID_ARGUMENT):
-            self.failed[label] = f"{code}: {message}"
+            self.failed[label], self.over = f"{code}: {message}", self.over or code in _OVER
             return None
         if request.object_at is not None:
             spot = (float(request.object_at[0]), float(request.object_at[1]))
@@ -377,11 +379,6 @@ class Order:
         self.left = [left for left in self.left if left not in other]
         self.left.append(replace(one, arm=_ANY_ARM) if other else one)
         return self.left[-1]
-
-    @property
-    def over(self) -> bool:
-        """Whether the robot cannot go on."""
-        return any(text.startswith(tuple(f"{code}:" for code in _OVER)) for text in self.failed.values())
 
     @property
     def outcome(self) -> str:

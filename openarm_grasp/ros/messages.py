@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -110,42 +110,21 @@ def fill_answer(answer: Grasp.Response | Pick.Result | PickResult, outcome: Gras
 
 def option_to_msg(option: Option) -> GraspOption:
     """The result of one grasp that was weighed."""
-    return GraspOption(
-        id=option.id,
-        arm=option.arm,
-        score=option.score,
-        parts=list(option.parts),
-        values=list(option.parts.values()),
-        limit_margin=option.limit_margin,
-        code=str(option.code),
-        message=option.message,
-    )
+    parts = {"parts": list(option.parts), "values": list(option.parts.values())}
+    return GraspOption(**asdict(option) | parts | {"code": str(option.code)})
 
 
 def option_from_msg(message: GraspOption) -> Option:
     """The same, of an answer."""
-    return Option(
-        message.id,
-        message.arm,
-        message.score,
-        dict(zip(message.parts, message.values, strict=True)),
-        message.limit_margin,
-        message.code,
-        message.message,
-    )
+    same = {one.name: getattr(message, one.name) for one in fields(Option)}
+    return Option(**same | {"parts": dict(zip(message.parts, message.values, strict=True))})
 
 
 def pair_result(outcome: PairOutcome) -> PickTwo.Result:
     """The answer to two requests."""
-    result = PickTwo.Result(
-        success=outcome.success,
-        outcome=outcome.kind,
-        code=outcome.code.value,
-        message=outcome.message,
-        simultaneous=outcome.simultaneous,
-        duration=outcome.duration,
-        recording=outcome.recording,
-    )
+    names = ("success", "message", "simultaneous", "duration", "recording")
+    same = {name: getattr(outcome, name) for name in names}
+    result = PickTwo.Result(outcome=outcome.kind, code=outcome.code.value, **same)
     for one in outcome.answers:
         answer = PickResult()
         fill_answer(answer, one)
@@ -155,18 +134,10 @@ def pair_result(outcome: PairOutcome) -> PickTwo.Result:
 
 def status_msg(status: Status, frame: str, t_ns: int) -> GraspStatus:
     """A state that was entered."""
-    return GraspStatus(
-        header=Header(stamp=ns_to_stamp(t_ns), frame_id=frame),
-        state=status.state.value,
-        previous_state=status.previous.value,
-        reason=status.reason,
-        attempt=status.attempt,
-        label=status.label,
-        arm=status.arm,
-        plan_id=status.plan.id if status.plan else "",
-        code=status.code,
-        budget=status.budget,
-    )
+    same = {name: getattr(status, name) for name in ("reason", "attempt", "label", "arm", "code", "budget")}
+    state, plan = {"state": status.state.value, "previous_state": status.previous.value}, status.plan
+    header = Header(stamp=ns_to_stamp(t_ns), frame_id=frame)
+    return GraspStatus(header=header, plan_id=plan.id if plan else "", **state, **same)
 
 
 # --- pictures

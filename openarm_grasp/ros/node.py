@@ -109,33 +109,22 @@ class GraspNode(BaseNode[GraspConfig]):
         messages.fill_answer(response, await self._one(messages.request_from_msg(request)))
         return response
 
-    def _on_confirm(self, request: ConfirmPlan.Request, response: ConfirmPlan.Response) -> ConfirmPlan.Response:
-        try:
-            response.message = self._session.gate.answer(request.plan_id, accept=request.accept)
-            response.success, response.code = True, Code.OK.value
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
-        return response
+    async def _on_confirm(self, request: ConfirmPlan.Request, response: ConfirmPlan.Response) -> ConfirmPlan.Response:
+        async def answer() -> str:
+            return self._session.gate.answer(request.plan_id, accept=request.accept)
+
+        return await _told(response, answer())
 
     async def _on_release(self, request: ReleaseHand.Request, response: ReleaseHand.Response) -> ReleaseHand.Response:
-        try:
-            response.message = await self._take(
-                "the release of a hand", self._arms, lambda: self._session.release(self._skills, request.arm)
-            )
-            response.success, response.code = True, Code.OK.value
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
+        def work() -> Awaitable[str]:
+            return self._session.release(self._skills, request.arm)
+
+        await _told(response, self._take("the release of a hand", self._arms, work))
         self.get_logger().info(f"release of the {request.arm or 'full'} hand: {response.message}")
         return response
 
     async def _on_learn(self, arm: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            response.message = await self._take(
-                "the learning of a hand", self._arms, lambda: self._learn(arm, self._robot)
-            )
-            response.success = True
-        except OpenArmError as error:
-            response.message = f"{error.code}: {error.message}"
+        await _told(response, self._take("the learning of a hand", self._arms, lambda: self._learn(arm, self._robot)))
         self.get_logger().info(response.message)
         return response
 
@@ -353,6 +342,21 @@ class GraspNode(BaseNode[GraspConfig]):
         answered = before is not None and before.plan is not None
         if status.candidates or status.plan or answered:
             self._marker_topic.publish(messages.status_markers(status, self.description, t_ns))
+
+
+async def _told(response: Any, work: Awaitable[str]) -> Any:
+    """Write what came of work into the response of a service; one of `Trigger` has its code in the message."""
+    code = Code.OK
+    try:
+        response.message = await work
+    except OpenArmError as error:
+        code, response.message = error.code, error.message
+    response.success = code is Code.OK
+    if not isinstance(response, Trigger.Response):
+        response.code = code.value
+    elif not response.success:
+        response.message = f"{code}: {response.message}"
+    return response
 
 
 def _id_of(goal: ServerGoalHandle) -> bytes:
