@@ -250,7 +250,7 @@ def order(
         timeout: Longest wait for one object, s.
     """
     from openarm_grasp.requests.bins import load_bins
-    from openarm_grasp.requests.orders import Order
+    from openarm_grasp.requests.orders import GONE, Order
 
     join_graph(domain)
     from openarm_common.robot.description import RobotDescription
@@ -278,7 +278,7 @@ def order(
                     row = {"label": label, "position": seen and list(seen), "code": result.code}
                     place = list(result.place_position) if result.success else None
                     results.append({**row, "message": result.message, "place": place})
-                    if left is not None or result.code not in (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED):
+                    if left is not None or result.code not in GONE:
                         shown.print(f"{label}: {result.code}: {result.message}", markup=False)
         except BaseException as error:
             while running and wait(running, _CANCEL_S).not_done:  # one that was just begun, too

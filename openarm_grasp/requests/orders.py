@@ -26,9 +26,9 @@ _WITHOUT_ARM = _OVER[1:]
 #: The arm of a request that any arm may carry out.
 _ANY_ARM = "auto"
 #: There is no more of it in view.
-_GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
+GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 #: What is refused so may be taken where others are pushed away from it.
-_BY_PLACE = (*(code for code in NO_WAY if code is not Code.TOO_WIDE), *_GONE)
+_BY_PLACE = (*(code for code in NO_WAY if code is not Code.TOO_WIDE), *GONE)
 #: What is refused so may lie on others, keep a hand from them, or lie badly itself; the likelier first.
 _IN_THE_WAY = (Code.TOO_WIDE, Code.IN_COLLISION, Code.NO_PLAN, Code.UNREACHABLE)
 #: With these the camera had not shown enough yet: another look may.
@@ -244,7 +244,7 @@ class Order:
     def _otherwise(self) -> int:
         """How many things were not seen at their places: they are seen as parts of something else now."""
         by_place = (one for one in self._in_vain if one.request.object_at is not None and not one.aside)
-        return sum(one.code in _GONE and not one.seen for one in by_place)
+        return sum(one.code in GONE and not one.seen for one in by_place)
 
     def _may_push(self, label: str, where: Spot) -> bool:
         pushed = [one.request.object_at for one in self._in_vain if one.aside]
@@ -325,9 +325,9 @@ class Order:
         if request.object_at is not None:
             spot = (float(request.object_at[0]), float(request.object_at[1]))
             self._by_place += [spot, *([] if where is None else [where])]
-            if code not in _GONE:  # what is not seen there any more stays on the list of what was left
+            if code not in GONE:  # what is not seen there any more stays on the list of what was left
                 self.left = [one for one in self.left if one not in tuple(self._at(spot))]
-        if where is None and code in _GONE:
+        if where is None and code in GONE:
             if request.object_at is None:
                 return self._none_left(label, arm, code, message)
             self._moved += self._otherwise < _UNSEEN
@@ -335,7 +335,7 @@ class Order:
         unseen = self._unseen
         if self._given_up or unseen >= _UNSEEN or (where is None and not unseen):
             self._asked.add((label, arm))
-        if code in _GONE and where is not None and any(self._at(where, label)):
+        if code in GONE and where is not None and any(self._at(where, label)):
             return None
         return self._leave(Left(label, where, code, message, after, arm))
 

@@ -94,12 +94,15 @@ def test_what_was_cancelled_ends_nothing_that_comes_later(bench) -> None:
     assert bench.ask("red", arm="right").success
 
 
-def test_an_order_asks_both_arms_and_what_is_placed_by_one_is_not_taken_by_the_other(bench, tmp_path) -> None:
+def test_an_order_asks_both_arms_and_what_is_placed_by_one_is_not_taken_by_the_other(bench, tmp_path, capsys) -> None:
     report = tmp_path / "answer.json"
     words = f"order anything --domain {os.environ['ROS_DOMAIN_ID']} --json {report}".split()
     code = bench.in_thread(lambda: cli.run(words))
     written = json.loads(report.read_text(encoding="utf-8"))
     assert (code, written["outcome"], written["placed"]) == (0, "SUCCESS", ["anything"] * 2), written
+    said = "".join(capsys.readouterr())
+    assert said.count("anything: OK: ") == 2
+    assert "UNKNOWN_OBJECT" not in said
     assert {arm for arm, _, _ in bench.world.asked} == {"left", "right"}
     places = [row["place"][:2] for row in written["results"] if row["place"]]
     for place in places:
