@@ -77,6 +77,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "place_error_mm": spread(grasp["place_error_mm"] for grasp in done),
         "cycle_s": spread(grasp["sim_s"] for grasp in done),
         "picks_per_hour": round(3600.0 * len(done) / seconds) if seconds > 0.0 else None,
+        "waiting": _waiting(rows),
         "state_s": _states(done),
     }
 
@@ -136,6 +137,16 @@ def _kinds(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
+def _waiting(rows: Sequence[Row]) -> float | None:
+    """Return the share of the time of scenes in which an arm has nothing to do; None where no two arms work at once."""
+    busy, lasted = 0.0, 0.0
+    for row in (row for row in rows if "arm_clearance_mm" in row):
+        worked = [grasp for grasp in row["grasps"] if grasp["arm"]]
+        busy += sum(grasp["sim_s"] for grasp in worked)
+        lasted += len({grasp["arm"] for grasp in worked}) * float(row["sim_s"])
+    return round(1.0 - busy / lasted, 3) if lasted else None
+
+
 def _states(grasps: Sequence[Row]) -> dict[str, float]:
     """Mean time a placed object spent in each state, s."""
     total: dict[str, float] = defaultdict(float)
@@ -177,6 +188,8 @@ def figures(data: Mapping[str, Any]) -> list[tuple[str, str]]:
             v = s[key]
             out.append((name, f"median {v['median']:g}, p95 {v['p95']:g}, max {v['max']:g} {unit}"))
     out.append(("objects placed in an hour of robot time, failures included", str(s["picks_per_hour"] or "none")))
+    if s["waiting"] is not None:
+        out.append(("arms wait", f"{100 * s['waiting']:.0f} % of the time"))
     rate = data["scenes_per_hour"]
     speed = f", {rate} scenes an hour with {data['workers']} worker(s)" if rate else ""
     machine = data["machine"]

@@ -233,6 +233,7 @@ def test_figures_say_what_is_graspable_and_what_of_it_was_placed() -> None:
         "seen": 2, "grasps found": 1, "planned": 0, "held": 0, "lifted": 0, "placed": 1, "claimed": 1
     }  # fmt: skip
     assert s["picks_per_hour"] == 60
+    assert s["waiting"] is None
     told = dict(
         report.figures(
             {"summary": s, "asked": 3, "scenes_per_hour": None, "machine": {"cores": 1, "cpu": ""}, "wall_s": 1.0}
@@ -249,3 +250,10 @@ def test_the_folders_of_the_suite_are_those_that_are_made(tmp_path) -> None:
     assert made.size == pytest.approx(kept.size, abs=1e-4)
     assert len(made.parts) == len(kept.parts)
     refused("no object 'nothing'; objects: apple", make_objects, tmp_path, ("nothing",))
+
+
+def test_figures_say_what_share_of_the_time_arms_wait() -> None:
+    row = crashed_row(make_task("pairs", 0, ""), RuntimeError("x")) | {"detector": "color", "sim_s": 10.0}
+    grasp = {"target": "a", "placed": True, "code": "OK", "place_error_mm": 1.0}
+    row["grasps"] = [grasp | {"arm": "left", "sim_s": 10.0}, grasp | {"arm": "right", "sim_s": 6.0}]
+    assert report.summarise([row | {"arm_clearance_mm": 50.0}])["waiting"] == pytest.approx(0.2)
