@@ -8,7 +8,7 @@ Writes FOLDER/order.webp, FOLDER/order.mp4 and FOLDER/order.svg; the scene is th
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,7 +37,7 @@ def film(robot: SimRobot, into: Film) -> None:
     robot.tick = watched  # type: ignore[method-assign]
 
 
-def main(seed: int = 4000, folder: Path = Path()) -> None:
+def main(seed: int, folder: Path) -> None:
     """Carry out an order, and write film and picture."""
     sets = CampaignOptions(set_name="orders").graph_parameters()
     trials = Trials(make_task("orders", seed, ""), SimulatedSenses(sets=sets), suite_config(sets).grasp)
@@ -50,4 +50,7 @@ def main(seed: int = 4000, folder: Path = Path()) -> None:
 
 
 if __name__ == "__main__":
-    main(*(kind(text) for kind, text in zip((int, Path), sys.argv[1:], strict=False)))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("seed", nargs="?", type=int, default=4000)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path())
+    main(**vars(parser.parse_args()))
