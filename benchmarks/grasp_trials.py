@@ -21,7 +21,7 @@ from openarm_common.robot.folder import robot_work
 from openarm_common.scene.scene import Scene, SceneObject
 from openarm_common.types import Array
 from openarm_grasp.planning.candidates import tcp_height
-from openarm_motion.kinematics.chain import ArmKinematics, Solution
+from openarm_motion.kinematics.chain import ArmKinematics, IkSolution
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_sim_bridge.world.model import PhysicsConfig, compile_model
 from openarm_sim_bridge.world.world import start_qpos
@@ -68,7 +68,7 @@ class Grasp:
 
     inverse: InverseKinematics
     T: Array
-    start: Solution
+    start: IkSolution
     width: float
 
     def q(self, back: float = 0.0, up: float = 0.0, sideways: float = 0.0) -> Array:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from openarm_calibration.board.board import CircleGrid
-from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, project
+from openarm_calibration.handeye.problem import BoardView, Problem, Setup, assemble, project
 from openarm_calibration.handeye.refine import information_at
 from openarm_calibration.handeye.transforms import inverses, moved
 from openarm_calibration.handeye.unknowns import Noise
@@ -101,7 +101,7 @@ def make(setup: Setup, C: Array, noise: Noise, rng: np.random.Generator) -> Trut
     reported = moved(A, error)
     seen = [project(BOARD.points, BOARD.radius, T, _ROW) + rng.normal(0.0, noise.px, (len(BOARD.points), 2)) for T in C]
     listed = [
-        View(BOARD.points, pixels, reported[i], setup, radius=BOARD.radius, pose=i, name=f"s{i:02d}")
+        BoardView(BOARD.points, pixels, reported[i], setup, radius=BOARD.radius, pose=i, name=f"s{i:02d}")
         for i, pixels in enumerate(seen)
     ]
     return Truth(assemble(listed, [INTRINSICS], list(C)), X, Z, A)

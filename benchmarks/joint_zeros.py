@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.report import Row, write_report
 from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.handeye.marks import project
-from openarm_calibration.handeye.problem import Setup, View
+from openarm_calibration.handeye.problem import BoardView, Setup
 from openarm_calibration.handeye.solve import SolveConfig
 from openarm_calibration.handeye.transforms import moved, skews
 from openarm_calibration.handeye.unknowns import Noise
@@ -90,7 +90,7 @@ def postures(
         if not ((pixels > 8.0) & (pixels < np.array(size) - 8.0)).all():
             continue
         pixels = pixels + rng.normal(0.0, noise.px, pixels.shape)
-        view = View(BOARD.points, pixels, A, setup, BOARD.radius, name=f"{spec.name}_{arm}_{len(out):02d}")
+        view = BoardView(BOARD.points, pixels, A, setup, BOARD.radius, name=f"{spec.name}_{arm}_{len(out):02d}")
         out.append(ArmView(view, base, tip, dict(zip(names, q.tolist(), strict=True)), T))
     return out, X, Z
 

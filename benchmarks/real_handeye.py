@@ -29,7 +29,7 @@ from openarm_calibration.handeye.choice import solve_chosen
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
 from openarm_calibration.handeye.left_out import column_squares
 from openarm_calibration.handeye.marks import Indices
-from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, chain
+from openarm_calibration.handeye.problem import BoardView, Problem, Setup, assemble, chain
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.zeros import ArmView, ZerosResult, arm_problem, solve_zeros
 from openarm_common.camera.cameras import Intrinsics
@@ -63,7 +63,7 @@ def read_set(path: Path) -> RealSet:
     K = np.array(camera["K"], dtype=np.float64).reshape(3, 3)
     optics = Intrinsics(camera["width"], camera["height"], K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     distortion = np.array(camera.get("D", ()), dtype=np.float64)
-    views: list[View] = []
+    views: list[BoardView] = []
     guesses: list[Array] = []
     for number, sample in enumerate(data["samples"]):
         points = np.array(sample["corners_board_m"], dtype=np.float64)
@@ -71,7 +71,9 @@ def read_set(path: Path) -> RealSet:
         if distortion.any():
             pixels = cv2.undistortPoints(pixels[:, None], K, distortion, P=K)[:, 0].astype(np.float64)
         views.append(
-            View(points, pixels, np.array(sample["T_base_tip"]), _SETUPS[data["setup"]], pose=number, name=sample["id"])
+            BoardView(
+                points, pixels, np.array(sample["T_base_tip"]), _SETUPS[data["setup"]], pose=number, name=sample["id"]
+            )
         )
         guesses.append(guess_pose(points, pixels, 0.0, optics)[0])
     arm = tuple(

@@ -50,7 +50,7 @@ from openarm_common.types import Array
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_motion.collision.exact import Clearance
 from openarm_motion.collision.solids import Box, box_from
-from openarm_motion.config import MotionConfig, ServoConfig
+from openarm_motion.config import MotionConfig, ServoingConfig
 from openarm_motion.planning.arm import Arm
 from openarm_motion.ros.client import MotionClient
 from openarm_motion.service.motion_service import make_arms, table_box
@@ -287,7 +287,7 @@ def _steady(arm: Arm, q: Array) -> Jog:
 
 
 def _plain_step(arm: Arm, q: Array, command: Jog) -> Array:
-    scale = ServoConfig().scale
+    scale = ServoingConfig().scale
     if command.joints is not None:
         velocity = scale.joint * command.joints
     else:

@@ -17,7 +17,7 @@ from openarm_common.camera.cameras import near_camera, table_camera
 from openarm_common.config import Config
 
 
-class PlaceConfig(Config):
+class BoardPlace(Config):
     """Where a board is, roughly: as measured with a ruler. Without it the board must be in view at the start."""
 
     position: tuple[float, ...] = Field(default=(), description="of its middle, m: three numbers, or none: unknown")
@@ -25,7 +25,7 @@ class PlaceConfig(Config):
     y_axis: tuple[float, float, float] = Field(default=(-1.0, 0.0, 0.0), description="direction down the board")
 
     @model_validator(mode="after")
-    def _whole(self) -> PlaceConfig:
+    def _whole(self) -> BoardPlace:
         if len(self.position) not in (0, 3):
             raise ValueError(f"position has {len(self.position)} numbers, expected three, or none")
         if np.linalg.norm(np.cross(self.z_axis, self.y_axis)) < 1e-6:
@@ -56,10 +56,8 @@ class AutoConfig(Config):
     )
     move_timeout: float = Field(default=60.0, gt=0.0, description="longest wait for a motion, s of wall clock")
     plate: float = Field(default=0.01, gt=0.0, description="thickness that plans allow for the board, m")
-    on_table: PlaceConfig = Field(default_factory=PlaceConfig, description="board of a camera that moves, base frame")
-    on_hand: PlaceConfig = Field(
-        default_factory=PlaceConfig, description="board of a fixed camera, frame of the carrier"
-    )
+    on_table: BoardPlace = Field(default_factory=BoardPlace, description="board of a camera that moves, base frame")
+    on_hand: BoardPlace = Field(default_factory=BoardPlace, description="board of a fixed camera, frame of the carrier")
     as_in_scene: bool = Field(
         default=False, description="a board whose place is not given is where the scene calibration_CAMERA has it"
     )

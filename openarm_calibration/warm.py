@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from openarm_calibration.board.board import CircleGrid
-from openarm_calibration.handeye.problem import View, assemble, project
+from openarm_calibration.handeye.problem import BoardView, assemble, project
 from openarm_calibration.handeye.solve import solve
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
@@ -20,7 +20,9 @@ def warm() -> None:
     poses = [se3.make(se3.exp_so3(turn), (0.0, 0.0, 0.4)) for turn in turns]
     pixels = [project(board.points, board.radius, T, row) for T in poses]
     views = [
-        View(board.points, seen + rng.normal(0.0, 0.1, seen.shape), se3.inverse(T), "in_hand", board.radius, pose=k)
+        BoardView(
+            board.points, seen + rng.normal(0.0, 0.1, seen.shape), se3.inverse(T), "in_hand", board.radius, pose=k
+        )
         for k, (T, seen) in enumerate(zip(poses, pixels, strict=True))
     ]
     solve(assemble(views, [optics], poses))

@@ -12,7 +12,7 @@ from numba.core import event
 _COMPILE = "numba:compile"
 
 
-class _Listener(event.Listener):
+class _CompileListener(event.Listener):
     """Says once for each package that its kernels are being compiled."""
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class _Listener(event.Listener):
         pass
 
 
-_LISTENER = _Listener()
+_LISTENER = _CompileListener()
 
 
 def announce(say: Callable[[str], object]) -> None:

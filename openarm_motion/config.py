@@ -20,7 +20,7 @@ from openarm_motion.collision.exact import Clearance
 from openarm_motion.timing.trajectory import JointLimits
 
 
-class LimitsConfig(Config):
+class MotionLimits(Config):
     """What the joints of an arm may do, from the shoulder to the wrist; plans use these times the velocity scale."""
 
     velocity: tuple[float, ...] = Field(default=(), description="rad/s, one number a joint; empty: the robot's")
@@ -30,7 +30,7 @@ class LimitsConfig(Config):
     default_scale: float = Field(default=0.5, gt=0.0, le=1.0, description="velocity scale of a request that has none")
 
     @model_validator(mode="after")
-    def _positive_and_alike(self) -> LimitsConfig:
+    def _positive_and_alike(self) -> MotionLimits:
         sizes = {len(row) for row in (self.velocity, self.acceleration, self.jerk) if row}
         if len(sizes) > 1 or min(self.velocity + self.acceleration + self.jerk, default=1.0) <= 0.0:
             raise ValueError("velocity, acceleration and jerk need one number > 0 for each joint")
@@ -185,7 +185,7 @@ class ServoClearance(Clearance):
     hand: float = Field(default=0.005, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
 
 
-class ServoConfig(Config):
+class ServoingConfig(Config):
     """How arms follow twists and joint velocities; names as MoveIt Servo has them."""
 
     enabled: bool = Field(
@@ -218,7 +218,7 @@ class ServoConfig(Config):
     )
 
     @model_validator(mode="after")
-    def _in_order(self) -> ServoConfig:
+    def _in_order(self) -> ServoingConfig:
         low, high = self.lower_singularity_threshold, self.hard_stop_singularity_threshold
         if high <= low:
             raise ValueError(
@@ -240,11 +240,15 @@ class MotionConfig(Config):
         default="demo", description="scene whose table is an obstacle: a name, a path, or empty for none"
     )
     map: MapConfig = Field(default_factory=MapConfig, description="the map of the surroundings")
-    limits: LimitsConfig = Field(default_factory=LimitsConfig, description="of the joints")
+    limits: MotionLimits = Field(default_factory=MotionLimits, description="of the joints")
     clearance: Clearance = Field(default_factory=Clearance, description="on free paths")
     straight: StraightClearance = Field(default_factory=StraightClearance, description="clearance on straight parts")
     planning: PlanningConfig = Field(default_factory=PlanningConfig, description="search")
     execution: ExecutionConfig = Field(default_factory=ExecutionConfig, description="monitoring of execution")
     faults: FaultsConfig = Field(default_factory=FaultsConfig, description="fault injection")
     move_group: MoveGroupConfig = Field(default_factory=MoveGroupConfig, description="MoveIt's names")
-    servo: ServoConfig = Field(default_factory=ServoConfig, description="twists and joint velocities")
+    servo: ServoingConfig = Field(default_factory=ServoingConfig, description="twists and joint velocities")
+
+
+class NoParameters(Config):
+    """Parameters of a node beside the motion node in its process: they are those of the motion node."""

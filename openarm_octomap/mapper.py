@@ -56,7 +56,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Snapshot:
+class MapSnapshot:
     """The map at one moment.
 
     Attributes:
@@ -73,7 +73,7 @@ class Snapshot:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class MapAnswer:
     """The state of the map at points.
 
     Attributes:
@@ -88,7 +88,7 @@ class Answer:
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
+class MapReport:
     """What an update did.
 
     Attributes:
@@ -101,7 +101,7 @@ class Report:
         outdated: Whether the frames were left out, as the map was reset, loaded or edited after they were taken.
     """
 
-    snapshot: Snapshot
+    snapshot: MapSnapshot
     changed: CellSet
     removed: Mapping[str, Mapping[str, int]] = field(default_factory=dict[str, Mapping[str, int]])
     flying: Mapping[str, int] = field(default_factory=dict[str, int])
@@ -169,7 +169,7 @@ class Mapper:
         distances: Floats | None = None,
         wanted: Collection[str] = (),
         edition: int | None = None,
-    ) -> Report:
+    ) -> MapReport:
         """Put the frames of one moment into the map.
 
         Args:
@@ -213,7 +213,7 @@ class Mapper:
                 reset = gone.size
             if distances is not None:
                 self._transform.compute(self._grid.blocks, distances)
-            return Report(
+            return MapReport(
                 snapshot=self._snapshot(wanted),
                 changed=changed,
                 removed=removed,
@@ -223,7 +223,7 @@ class Mapper:
                 outdated=outdated,
             )
 
-    def snapshot(self, wanted: Collection[str] = ()) -> Snapshot:
+    def snapshot(self, wanted: Collection[str] = ()) -> MapSnapshot:
         """Return the map as it is; `wanted` as for `update`."""
         with self._lock:
             return self._snapshot(wanted)
@@ -280,7 +280,7 @@ class Mapper:
         write_file(path, payload, self._grid.lattice.resolution, self._robot)
         return payload.nodes
 
-    def query(self, points: ArrayLike, resolution: float, unknown: UnknownPolicy) -> Answer:
+    def query(self, points: ArrayLike, resolution: float, unknown: UnknownPolicy) -> MapAnswer:
         """Look up the state of points.
 
         Args:
@@ -306,7 +306,7 @@ class Mapper:
         with self._lock:
             states = self._grid.states_at(at, depth)
         blocked = (states == OCCUPIED) | ((states == UNKNOWN) & (unknown == "occupied"))
-        return Answer(states, blocked, edge * 2 ** (DEPTH - depth))
+        return MapAnswer(states, blocked, edge * 2 ** (DEPTH - depth))
 
     def load(self, path: Path) -> Taken:
         """Replace the map by that of a file.
@@ -341,9 +341,9 @@ class Mapper:
         text += f"; {counts['occupied']} cells are occupied and {counts['free']} free"
         return Taken(leaves.nodes, outside, f"{text}; {outside} leaves outside of the workspace")
 
-    def _snapshot(self, wanted: Collection[str]) -> Snapshot:
+    def _snapshot(self, wanted: Collection[str]) -> MapSnapshot:
         grid = self._grid
-        return Snapshot(
+        return MapSnapshot(
             lattice=grid.lattice,
             binary=grid.binary(),
             full=grid.full() if "full" in wanted else None,

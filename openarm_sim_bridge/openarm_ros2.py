@@ -29,7 +29,7 @@ Done = Callable[[End, str], None]
 
 
 @dataclass
-class _Goal:
+class _FollowedGoal:
     t: Array
     q: Array
     start_ns: int
@@ -54,12 +54,12 @@ class PositionController:
         self.measured: Array = position.copy()
         self.velocity: Array = np.zeros_like(position)
         self.t_ns = 0
-        self._goal: _Goal | None = None
+        self._goal: _FollowedGoal | None = None
 
     def start(self, trajectory: Trajectory, t_ns: int, done: Done) -> None:
         """Follow a checked trajectory from now on; one that runs is given up."""
         self._end(End.CANCELLED, "a newer trajectory took its place")
-        self._goal = _Goal(trajectory.t, trajectory.q, trajectory.start_ns or t_ns, self.measured.copy(), done)
+        self._goal = _FollowedGoal(trajectory.t, trajectory.q, trajectory.start_ns or t_ns, self.measured.copy(), done)
 
     def cancel(self) -> None:
         """Hold where the joints are, which lets a soft arm sink."""

@@ -73,7 +73,7 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class Hypothesis:
     """A convention, and what it leaves of the poses.
 
     Args:
@@ -132,12 +132,12 @@ class Unexplained(OpenArmError):
         tried: All conventions that were tried.
     """
 
-    def __init__(self, message: str, tried: tuple[Tried, ...]) -> None:
+    def __init__(self, message: str, tried: tuple[Hypothesis, ...]) -> None:
         super().__init__(Code.DEGENERATE, message)
         self.tried = tried
 
 
-def search(robot: Poses, board: Poses, setups: Sequence[Setup]) -> tuple[Tried, ...]:
+def search(robot: Poses, board: Poses, setups: Sequence[Setup]) -> tuple[Hypothesis, ...]:
     """Try conventions; the best first. Those that contradict what is stated are among them.
 
     Args:
@@ -161,7 +161,7 @@ def search(robot: Poses, board: Poses, setups: Sequence[Setup]) -> tuple[Tried, 
     chosen += [pair for pair in pairs if A[pair[0]].stated and C[pair[1]].stated][:1]
     every = list(itertools.product(dict.fromkeys(chosen), (False, True)))
 
-    def solved(one: tuple[tuple[int, int], bool], rounds: int) -> Tried:
+    def solved(one: tuple[tuple[int, int], bool], rounds: int) -> Hypothesis:
         (i, j), flipped = one
         return _solved((A[i], robot), (C[j], board), flipped, setups, rounds)
 
@@ -172,7 +172,7 @@ def search(robot: Poses, board: Poses, setups: Sequence[Setup]) -> tuple[Tried, 
     return tuple(sorted(out, key=lambda one: one.score))
 
 
-def decided(tried: tuple[Tried, ...], setups: Sequence[Setup], robot: Poses, board: Poses) -> Tried:
+def decided(tried: tuple[Hypothesis, ...], setups: Sequence[Setup], robot: Poses, board: Poses) -> Hypothesis:
     """Return the convention that explains the poses.
 
     Args:
@@ -208,7 +208,7 @@ def decided(tried: tuple[Tried, ...], setups: Sequence[Setup], robot: Poses, boa
     return given
 
 
-def table(tried: Sequence[Tried]) -> str:
+def table(tried: Sequence[Hypothesis]) -> str:
     """Return lines for a terminal."""
     lines = ["conventions of the poses, by what the mounts leave that most pairs agree with"]
     for one in tried[:8]:
@@ -255,7 +255,7 @@ def _read_all(poses: Poses, some: NDArray[np.int64], apart: NDArray[np.int64]) -
 
 def _solved(
     robot: tuple[_Reading, Poses], board: tuple[_Reading, Poses], flipped: bool, setups: Sequence[Setup], rounds: int
-) -> Tried:
+) -> Hypothesis:
     """Return what two readings leave with one of the two equations: B = A, or its inverse."""
     (of_A, known_A), (of_C, known_C) = robot, board
     B = inverses(of_A.T) if flipped else of_A.T
@@ -276,7 +276,7 @@ def _solved(
     setup: Setup | None = next((one for one in setups if _flips(one, known_A, known_C) == flipped), None)
     units = known_A.unit in (None, unit_A) and known_C.unit in (None, unit_C)
     other: Setup = "to_hand" if setups[0] == "in_hand" else "in_hand"
-    return Tried(
+    return Hypothesis(
         other if setup is None else setup,
         replace(of_A.convention, unit=unit_A, inverse=known_A.inverse),
         replace(of_C.convention, unit=unit_C, inverse=known_C.inverse),
@@ -307,7 +307,7 @@ def _unlikely(A: Array, unit: Unit) -> bool:
     return not _NEAREST < float(np.abs(A[:, :3, 3]).max()) * UNITS[unit] < _FARTHEST
 
 
-def _standing_out(best: Tried, names: Sequence[str]) -> str:
+def _standing_out(best: Hypothesis, names: Sequence[str]) -> str:
     """Return which pose is off by far more than the others, in words."""
     away, turned = best.consensus.translations * UNITS[best.robot.unit], best.consensus.rotations
     if len(names) != len(away):
@@ -319,7 +319,7 @@ def _standing_out(best: Tried, names: Sequence[str]) -> str:
     return f"; {names[k]} stands out, {_length(float(away[k]))} and {math.degrees(turned[k]):.2g}° off"
 
 
-def _to_type(best: Tried, setups: Sequence[Setup], robot: Poses, board: Poses) -> str:
+def _to_type(best: Hypothesis, setups: Sequence[Setup], robot: Poses, board: Poses) -> str:
     """Return the options that state a convention in place of those that were stated."""
     words: list[str] = []
     for option, found, stated in (("", best.robot, robot), ("board-", best.board, board)):

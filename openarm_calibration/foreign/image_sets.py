@@ -19,7 +19,7 @@ from openarm_calibration.board.detection import BoardDetection, plane_fit
 from openarm_calibration.board.orientation import fronts
 from openarm_calibration.board.squares import Chessboard
 from openarm_calibration.foreign.conventions import Convention
-from openarm_calibration.foreign.explain import BOARD_FRAMES, Poses, Tried, decided, search, table
+from openarm_calibration.foreign.explain import BOARD_FRAMES, Hypothesis, Poses, decided, search, table
 from openarm_calibration.foreign.pose_robot import joints_of_pose, robot_of_poses
 from openarm_calibration.foreign.pose_source import Source
 from openarm_calibration.handeye.consensus import agreed
@@ -57,7 +57,7 @@ class ImageSet:
     """Samples of images or corners, the conventions that were tried, and what became of each image."""
 
     samples: SampleSet
-    tried: tuple[Tried, ...]
+    tried: tuple[Hypothesis, ...]
     rows: list[dict[str, Any]]
 
     @property
@@ -156,7 +156,9 @@ def image_set(
     return ImageSet(samples, tried, rows)
 
 
-def _read_alike(ways: list[list[_View]], robot: Poses, setup: Setup) -> tuple[list[_View], Poses, tuple[Tried, ...]]:
+def _read_alike(
+    ways: list[list[_View]], robot: Poses, setup: Setup
+) -> tuple[list[_View], Poses, tuple[Hypothesis, ...]]:
     """Return boards read so that most of them agree, their poses, and the conventions that were tried.
 
     Args:

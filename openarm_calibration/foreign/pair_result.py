@@ -24,7 +24,7 @@ _FAIL = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class PairResult:
+class JudgedPairs:
     """A solution with its grade, the reasons for it, and what is to be stored."""
 
     pairs: PosePairs
@@ -96,7 +96,7 @@ class PairResult:
 def pair_result(
     pairs: PosePairs, names: Names, limits: Limits | None = None, created: str = "",
     fixed: Mapping[str, float] | None = None, scale: float = 1.0,
-) -> PairResult:  # fmt: skip
+) -> JudgedPairs:  # fmt: skip
     """Solve pairs and grade the result.
 
     Args:
@@ -150,4 +150,4 @@ def pair_result(
         samples=used, created=created, versions=versions(),
     )  # fmt: skip
     grade: Grade = "fail" if worst >= _FAIL else "warn" if worst > 1.0 else "pass"
-    return PairResult(pairs, solution, names, grade, reasons, calibration)
+    return JudgedPairs(pairs, solution, names, grade, reasons, calibration)

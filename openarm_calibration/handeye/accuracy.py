@@ -57,7 +57,7 @@ class Accuracy:
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class PossibleTruth:
     """A mount and zeros as they may really be.
 
     Args:
@@ -102,7 +102,7 @@ def accuracy_of(samples: SampleSet, solution: Solution) -> Accuracy:
     columns = layout(part, answers[0].extras)["zeros"]
     both = np.r_[0:6, np.arange(columns.start, columns.stop)]
     truths = [
-        Truth(float(weight), answer.X[0], answer.zeros, answer.covariance()[np.ix_(both, both)])
+        PossibleTruth(float(weight), answer.X[0], answer.zeros, answer.covariance()[np.ix_(both, both)])
         for weight, answer in zip(weights, answers, strict=True)
         if weight >= _UNLIKELY
     ]
@@ -125,11 +125,11 @@ def accuracies(sessions: Sequence[SampleSet], result: ZerosResult) -> tuple[Accu
         both = np.r_[6 * camera : 6 * camera + 6, first + np.array(mine)]
         X, zeros = estimate.X[camera], estimate.zeros[mine]
         spread = covariance[np.ix_(both, both)]
-        out.append(_averaged(samples.with_zeros({}), X, zeros, [Truth(1.0, X, zeros, spread)]))
+        out.append(_averaged(samples.with_zeros({}), X, zeros, [PossibleTruth(1.0, X, zeros, spread)]))
     return tuple(out)
 
 
-def _averaged(samples: SampleSet, X: Array, zeros: Array, truths: Sequence[Truth]) -> Accuracy:
+def _averaged(samples: SampleSet, X: Array, zeros: Array, truths: Sequence[PossibleTruth]) -> Accuracy:
     """Return the accuracy of a mount (4, 4) and zeros (joints,) in use, averaged over what may be true."""
     hand = _Hand.of(samples, X, zeros)
     variance, miss = np.zeros(6 + len(zeros)), 0.0
@@ -174,7 +174,7 @@ class _Hand:
         seen = np.array([carrier.evaluate(q, zeros)[0] @ X for q in postures])
         return cls(samples.head.setup, X, tip, carrier, postures, believed, seen)
 
-    def square(self, truth: Truth) -> float:
+    def square(self, truth: PossibleTruth) -> float:
         """Return the mean square of how far the hand misses, m²."""
         X, zeros = truth.X, truth.zeros
         at = self._missed(X, zeros)

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from openarm_calibration.handeye.closed_form import METHODS
-from openarm_calibration.handeye.left_out import Held, closed_columns, held_out
+from openarm_calibration.handeye.left_out import HeldOut, closed_columns, held_out
 from openarm_calibration.handeye.problem import Problem
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.unknowns import Solution
@@ -56,7 +56,7 @@ def solve_chosen(problem: Problem, config: SolveConfig | None = None) -> Solutio
     return plain if others < ours else solution
 
 
-def _rank(held: Held, best: Array) -> tuple[float, float]:
+def _rank(held: HeldOut, best: Array) -> tuple[float, float]:
     """Return how far closed forms with errors (3,) beat an answer in any column, then its score; the lower the better.
 
     The score is the mean of minus twice the log density of left-out poses, up to a constant.

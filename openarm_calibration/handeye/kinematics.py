@@ -91,7 +91,7 @@ class Kinematics:
 
 
 @dataclass(frozen=True, eq=False)
-class Posture:
+class ArmPosture:
     """Joint positions of a view, as `problem.Arm`."""
 
     kinematics: Kinematics
@@ -103,9 +103,9 @@ class Posture:
         """Number of parameters."""
         return len(self.kinematics.parameters)
 
-    def scaled(self, factor: float) -> Posture:
+    def scaled(self, factor: float) -> ArmPosture:
         """Return the posture of positions in another unit."""
-        return Posture(self.kinematics, {name: value * factor for name, value in self.q.items()}, self.torque)
+        return ArmPosture(self.kinematics, {name: value * factor for name, value in self.q.items()}, self.torque)
 
     def at(self, zeros: Array) -> tuple[Array, Array]:
         """Return A (4, 4) at changed parameters, and how it changes with each (6, parameters)."""

@@ -28,7 +28,7 @@ _BETTER = 2.0
 
 
 @dataclass(frozen=True)
-class Held:
+class HeldOut:
     """Error of poses that the answer did not see.
 
     Args:
@@ -71,7 +71,7 @@ class Rival:
         )
 
 
-def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
+def held_out(problem: Problem, solution: Solution, folds: int) -> HeldOut:
     """Leave poses out in turn (`folds` groups; as many as poses is leave-one-out) and predict them.
 
     Poses whose absence leaves too few to solve are not counted.
@@ -107,12 +107,12 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
             squares[name] = px, px * float(T[k, 2, 3] / rows[k, 0]) ** 2
             marks[name] = float(in_space[k])
     if not squares:
-        return Held(math.nan, math.nan, {})
+        return HeldOut(math.nan, math.nan, {})
     px2, m2 = np.mean(list(squares.values()), axis=0)
     by_name = {name: (math.sqrt(a), math.sqrt(b)) for name, (a, b) in squares.items()}
     errors = np.concatenate(twists)
     columns = np.sqrt([px2, np.mean(np.sum(errors[:, :3] ** 2, axis=1)), np.mean(np.sum(errors[:, 3:] ** 2, axis=1))])
-    return Held(math.sqrt(px2), math.sqrt(m2), by_name, marks, errors, columns)
+    return HeldOut(math.sqrt(px2), math.sqrt(m2), by_name, marks, errors, columns)
 
 
 def board_twists(problem: Problem, T: Array) -> Array:
@@ -173,7 +173,7 @@ def in_space_squares(problem: Problem, T: Array) -> Array:
     return out
 
 
-def rival(problem: Problem, solution: Solution, one_out: Held) -> Rival | None:
+def rival(problem: Problem, solution: Solution, one_out: HeldOut) -> Rival | None:
     """Return the closed form that predicts left-out poses better than the refinement; None where there is none.
 
     Args:

@@ -40,7 +40,7 @@ UNITS = np.array([1e-3] * 3 + [math.radians(0.1)] * 3)
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class PoseSpread:
     """How far the robot moved between its poses.
 
     Args:
@@ -65,11 +65,11 @@ class Motion:
         return self.rotation >= _NO_ROTATION and self.second < _NO_SECOND_AXIS
 
 
-def motion(A: Array) -> Motion:
+def motion(A: Array) -> PoseSpread:
     """Describe the motion of robot poses A (n, 4, 4)."""
     n = len(A)
     if n < 2:
-        return Motion(n, 0.0, 0.0, 0.0, np.array([0.0, 0.0, 1.0]), "x")
+        return PoseSpread(n, 0.0, 0.0, 0.0, np.array([0.0, 0.0, 1.0]), "x")
     A = A[np.unique(np.linspace(0, n - 1, min(n, _MOST)).astype(int))]
     first, second = np.triu_indices(len(A), 1)
     w = Rotation.from_matrix(np.swapaxes(A[first, :3, :3], 1, 2) @ A[second, :3, :3]).as_rotvec()
@@ -78,7 +78,7 @@ def motion(A: Array) -> Motion:
     apart = np.linalg.norm(A[:, None, :3, 3] - A[None, :, :3, 3], axis=-1)
     rotation = float(np.linalg.norm(w, axis=1).max())
     least = "xyz"[int(np.argmin(np.sum(w**2, axis=0)))]
-    return Motion(n, rotation, float(across.max()), float(apart.max()), axis, least)
+    return PoseSpread(n, rotation, float(across.max()), float(apart.max()), axis, least)
 
 
 def require_motion(problem: Problem) -> None:
@@ -103,7 +103,7 @@ def require_motion(problem: Problem) -> None:
                 raise OpenArmError(Code.DEGENERATE, fault)
 
 
-def motion_fault(seen: Motion) -> str:
+def motion_fault(seen: PoseSpread) -> str:
     """Return why a motion determines no mounts, and what to add; empty when it may."""
     degrees, millimetres = math.degrees(seen.rotation), seen.translation * 1e3
     if seen.poses < FEWEST:
@@ -171,7 +171,7 @@ def condition_number(problem: Problem, information: Array) -> float:
     return float(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
 
-def _degenerate(problem: Problem, seen: Motion, noise: Noise, what: str) -> OpenArmError:
+def _degenerate(problem: Problem, seen: PoseSpread, noise: Noise, what: str) -> OpenArmError:
     """Return the refusal of an answer: its cause, what is wrong with it, and what to do."""
     advice = "add poses, nearer to the board and with larger rotations"
     if seen.rotation < _SMALL_ROTATION:

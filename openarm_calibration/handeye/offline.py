@@ -18,11 +18,11 @@ from openarm_calibration.handeye.choice import solve_chosen
 from openarm_calibration.handeye.closed_form import REFINED, checked_algorithm, closed_form
 from openarm_calibration.handeye.left_out import side_by_side
 from openarm_calibration.handeye.observability import condition_number, require_motion
-from openarm_calibration.handeye.problem import Problem, View, assemble, layout
+from openarm_calibration.handeye.problem import BoardView, Problem, assemble, layout
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.unknowns import Estimate, Outlier, Solution, invert_scaled
-from openarm_calibration.handeye.verdict import Limits, Verdict, assess
+from openarm_calibration.handeye.verdict import Grading, Limits, assess
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_calibration.store.store import StoredCalibration, versions
 from openarm_common import se3
@@ -47,7 +47,7 @@ class Result:
     """
 
     solution: Solution
-    verdict: Verdict
+    verdict: Grading
     methods: dict[str, dict[str, float] | str]
     calibration: StoredCalibration
 
@@ -191,7 +191,7 @@ def join(sessions: Sequence[SampleSet], *, one_board: bool = True) -> tuple[Prob
     own = tuple(samples.problem() for samples in sessions)
     boards: list[object] = []
     postures: list[tuple[tuple[str, str], dict[str, float]]] = []
-    views: list[View] = []
+    views: list[BoardView] = []
     for camera, (samples, problem) in enumerate(zip(sessions, own, strict=True)):
         head = samples.head
         kept = (head.setup, _links(samples)[0 if head.setup == "in_hand" else 1], samples.board)

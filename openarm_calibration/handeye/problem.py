@@ -38,7 +38,7 @@ Extra = Literal["scale", "delay", "intrinsics", "distortion", "zeros"]
 EXTRAS: tuple[Extra, ...] = ("scale", "delay", "intrinsics", "distortion", "zeros")
 
 
-class Arm(Protocol):
+class ViewJoints(Protocol):
     """Joint positions behind a robot pose."""
 
     @property
@@ -46,7 +46,7 @@ class Arm(Protocol):
         """Number of offsets."""
         ...
 
-    def scaled(self, factor: float) -> Arm:
+    def scaled(self, factor: float) -> ViewJoints:
         """Return the same with positions in another unit."""
         ...
 
@@ -56,7 +56,7 @@ class Arm(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """One board in one image.
 
     Args:
@@ -83,14 +83,14 @@ class View:
     pose: int = 0
     name: str = ""
     rate: Array = field(default_factory=lambda: np.zeros(6))
-    arm: Arm | None = None
+    arm: ViewJoints | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Views in the form that the solver reads; made by `assemble`, cut by `subset`."""
 
-    views: tuple[View, ...]
+    views: tuple[BoardView, ...]
     intrinsics: tuple[Intrinsics, ...]
     free: Array  # (n, 4, 4) T_camera_board of each view by itself
     free_cost: Array  # (n,) its sum of squared residuals, px²
@@ -158,7 +158,7 @@ class Problem:
         return replace(self, A=np.array([A for A, _ in found]), by_joints=np.array([by for _, by in found]))
 
 
-def assemble(views: Sequence[View], intrinsics: Sequence[Intrinsics], guesses: Sequence[Array]) -> Problem:
+def assemble(views: Sequence[BoardView], intrinsics: Sequence[Intrinsics], guesses: Sequence[Array]) -> Problem:
     """Make a problem of views.
 
     Args:
@@ -171,7 +171,7 @@ def assemble(views: Sequence[View], intrinsics: Sequence[Intrinsics], guesses: S
     return replace(raw, free=free, free_cost=cost)
 
 
-def _pack(views: tuple[View, ...], intrinsics: tuple[Intrinsics, ...], free: Array, cost: Array) -> Problem:
+def _pack(views: tuple[BoardView, ...], intrinsics: tuple[Intrinsics, ...], free: Array, cost: Array) -> Problem:
     _, pose = np.unique([view.pose for view in views], return_inverse=True)
     return Problem(
         views,

@@ -23,7 +23,7 @@ import numpy as np
 from openarm_calibration.handeye.problem import Extra, Problem, chain, design, layout
 from openarm_calibration.handeye.spread import FLOOR, averaged, criterion, search, search_misfit
 from openarm_calibration.handeye.transforms import moved
-from openarm_calibration.handeye.unknowns import FREE, ZERO_SCALES, Estimate, Noise, Priors, State, values
+from openarm_calibration.handeye.unknowns import FREE, ZERO_SCALES, Estimate, Noise, Priors, Unknowns, values
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -62,7 +62,7 @@ class Linear:
         )
 
 
-def linearise(problem: Problem, state: State, extras: Sequence[Extra], priors: Priors = FREE) -> Linear:
+def linearise(problem: Problem, state: Unknowns, extras: Sequence[Extra], priors: Priors = FREE) -> Linear:
     """Return the normal equations at a state.
 
     Args:
@@ -188,7 +188,7 @@ def refine(
     Raises:
         OpenArmError: INTERNAL, when the start is no description of the views (a mark behind the camera).
     """
-    state = State.start(problem, X, Z)
+    state = Unknowns.start(problem, X, Z)
     if zeros is not None and "zeros" in extras:
         state = replace(state, zeros=zeros)
     linear = linearise(problem, state, extras, priors)
@@ -261,10 +261,10 @@ def information_at(
         extras: More unknowns, at their usual values.
         priors: Priors of these.
     """
-    return eliminate(linearise(problem, State.start(problem, X, Z), extras, priors), noise)[0]
+    return eliminate(linearise(problem, Unknowns.start(problem, X, Z), extras, priors), noise)[0]
 
 
-def _stepped(problem: Problem, state: State, step: Array, correction: Array, extras: Sequence[Extra]) -> State:
+def _stepped(problem: Problem, state: Unknowns, step: Array, correction: Array, extras: Sequence[Extra]) -> Unknowns:
     part = {name: step[columns] for name, columns in layout(problem, extras).items()}
     return replace(
         state,

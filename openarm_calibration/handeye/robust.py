@@ -33,7 +33,7 @@ from openarm_calibration.handeye.unknowns import (
     PoseTest,
     Priors,
     Solution,
-    State,
+    Unknowns,
     at_zeros,
 )
 from openarm_common import se3
@@ -247,7 +247,7 @@ def _two_kinds(problem: Problem, out: Mask, estimate: Estimate) -> float:
     if not out.any():
         return math.inf
     part = at_zeros(problem, estimate).subset(out)
-    state, noise = State.start(part, estimate.X, estimate.Z), estimate.noise
+    state, noise = Unknowns.start(part, estimate.X, estimate.Z), estimate.noise
     state = replace(state, intrinsics=estimate.intrinsics, scale=estimate.scale, distortion=estimate.distortion)
     value = math.inf
     for _ in range(5):

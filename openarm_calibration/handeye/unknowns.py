@@ -122,7 +122,7 @@ FREE = Priors()
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class Unknowns:
     """The unknowns.
 
     Args:
@@ -146,7 +146,7 @@ class State:
     zeros: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def start(cls, problem: Problem, X: Array, Z: Array) -> State:
+    def start(cls, problem: Problem, X: Array, Z: Array) -> Unknowns:
         """Return mounts with nothing corrected."""
         cameras = problem.cameras
         return cls(
@@ -165,7 +165,7 @@ class State:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Estimate(State):
+class Estimate(Unknowns):
     """Where the refinement ended.
 
     Args:
@@ -197,7 +197,7 @@ def at_zeros(problem: Problem, estimate: Estimate) -> Problem:
     return problem.posed(estimate.zeros) if "zeros" in estimate.extras else problem
 
 
-def values(problem: Problem, state: State, extras: Sequence[Extra]) -> Array:
+def values(problem: Problem, state: Unknowns, extras: Sequence[Extra]) -> Array:
     """Return the extras of a state (parameters,), in the columns of `layout`; 0 in those of the mounts.
 
     Args:

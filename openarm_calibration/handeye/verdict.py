@@ -51,7 +51,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Grading:
     """Grade, why, the figures (SI units, px), and all checks.
 
     Args:
@@ -99,7 +99,7 @@ def assess(
     limits: Limits | None = None,
     stored: Array | None = None,
     by_zeros: Accuracy | None = None,
-) -> Verdict:
+) -> Grading:
     """Grade a solution of one camera.
 
     Args:
@@ -193,7 +193,7 @@ def assess(
     reasons = tuple(check.text for check in checks if check.ratio > 1.0)
     worst = max(check.ratio for check in checks)
     grade: Grade = "fail" if worst > _FAIL else "warn" if worst > 1.0 else "pass"
-    return Verdict(grade, reasons, figures, tuple(checks), "" if better is None else better.method)
+    return Grading(grade, reasons, figures, tuple(checks), "" if better is None else better.method)
 
 
 def _beyond(repeatable: float, accurate: float, limit: float) -> float:

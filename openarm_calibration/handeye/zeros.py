@@ -21,8 +21,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydantic import Field
 
-from openarm_calibration.handeye.kinematics import Kinematics, Posture
-from openarm_calibration.handeye.problem import SETUPS, Problem, View, assemble, layout
+from openarm_calibration.handeye.kinematics import ArmPosture, Kinematics
+from openarm_calibration.handeye.problem import SETUPS, BoardView, Problem, assemble, layout
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.unknowns import ZERO_SCALES, Priors, Solution
 from openarm_common.camera.cameras import Intrinsics
@@ -75,7 +75,7 @@ class ArmView:
         torque: Torque of the joints, N m; for flexure.
     """
 
-    view: View
+    view: BoardView
     base: str
     tip: str
     q: Mapping[str, float]
@@ -196,7 +196,7 @@ def arm_problem(
         names: Names of the parameters, as in `ZerosResult`.
     """
     chains = {ends: Kinematics(description, *ends, names) for ends in {(view.base, view.tip) for view in views}}
-    armed = [replace(view.view, arm=Posture(chains[view.base, view.tip], view.q, view.torque)) for view in views]
+    armed = [replace(view.view, arm=ArmPosture(chains[view.base, view.tip], view.q, view.torque)) for view in views]
     return assemble(armed, intrinsics, [view.guess for view in views])
 
 
@@ -218,7 +218,7 @@ def solve_zeros(
 
     Args:
         description: The robot, whose forward kinematics the reported positions are put through.
-        views: Views of any sets: `View.camera` and `View.board` number the mounts, `View.pose` the robot poses.
+        views: Views of any sets: `camera` and `board` number the mounts, `pose` the robot poses.
         intrinsics: Intrinsics of each camera.
         config: Priors.
         start: A solution of nearly the same views, to start from.

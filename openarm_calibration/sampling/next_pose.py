@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from openarm_calibration.board.board import Board
-from openarm_calibration.handeye.kinematics import Posture
+from openarm_calibration.handeye.kinematics import ArmPosture
 from openarm_calibration.handeye.observability import UNITS, motion
-from openarm_calibration.handeye.problem import Extra, View, assemble, project
+from openarm_calibration.handeye.problem import BoardView, Extra, assemble, project
 from openarm_calibration.handeye.refine import information_at, mount_error
 from openarm_calibration.handeye.robust import SolveConfig, solve_robustly
 from openarm_calibration.handeye.transforms import inverses
@@ -346,8 +346,8 @@ class PoseSearch:
         out: list[tuple[float, Array]] = []
         for q, T in found:
             pixels, at = project(board.points, board.radius, T, row), _joints(samples, q)
-            view = View(
-                board.points, pixels, samples.pose(at), samples.head.setup, board.radius, arm=Posture(kinematics, at)
+            view = BoardView(
+                board.points, pixels, samples.pose(at), samples.head.setup, board.radius, arm=ArmPosture(kinematics, at)
             )
             gain = information_at(assemble([view], [optics], [T]), X_all, Z_all, noise, extras)
             out.append((_left(invert_scaled(before + gain)), q))

@@ -30,8 +30,8 @@ from pydantic import Field, field_validator
 from openarm_calibration.board.board import Board, parse_board
 from openarm_calibration.board.detect import BoardDetection, guess_pose
 from openarm_calibration.foreign.pose_robot import are_of_pose
-from openarm_calibration.handeye.kinematics import Kinematics, Posture
-from openarm_calibration.handeye.problem import Problem, View, assemble
+from openarm_calibration.handeye.kinematics import ArmPosture, Kinematics
+from openarm_calibration.handeye.problem import BoardView, Problem, assemble
 from openarm_calibration.handeye.transforms import difference
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
@@ -244,7 +244,7 @@ class SampleSet:
         """
         if not self._samples:
             raise OpenArmError(Code.DEGENERATE, "too few poses: no samples; take at least 3, better 10 to 15")
-        views: list[View] = []
+        views: list[BoardView] = []
         kinematics = None if are_of_pose(self.joint_names) else self.kinematics(self.joint_names)
         for k, sample in enumerate(self._samples):
             t_ns = sample.t_image_ns - round(delay_s * 1e9)
@@ -252,8 +252,8 @@ class SampleSet:
             A = self.pose_at(sample, t_ns) if delay_s else self.pose(sample.joints)
             rate = difference(early, late) / (2e-9 * _RATE_STEP_NS)
             points = self.board.points[sample.detection.ids]
-            view = View(points, sample.detection.pixels, A, self.head.setup, self.board.radius, pose=k, rate=rate)
-            arm = None if kinematics is None else Posture(kinematics, sample.joints)
+            view = BoardView(points, sample.detection.pixels, A, self.head.setup, self.board.radius, pose=k, rate=rate)
+            arm = None if kinematics is None else ArmPosture(kinematics, sample.joints)
             views.append(replace(view, name=sample.name, arm=arm))
         return assemble(views, [self.head.optics], [sample.T_camera_board for sample in self._samples])
 

@@ -43,7 +43,7 @@ _MEASURED, _DERIVED = 1.0 / 8.0, 1.0 / 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
+class _JointState:
     """Positions and, where they were measured, velocities by joint name."""
 
     t_ns: int
@@ -63,7 +63,7 @@ class RobotStateBuffer:
     def __init__(self, description: RobotDescription, capacity: int = 400) -> None:
         self._description = description
         self._endless = [name for name, joint in description.joints.items() if joint.type == "continuous"]
-        self._states: deque[_State] = deque(maxlen=capacity)
+        self._states: deque[_JointState] = deque(maxlen=capacity)
         self._static: dict[str, tuple[str, Array]] = {}
         self._levers_of: dict[tuple[str, tuple[str, ...]], Array] = {}
 
@@ -94,7 +94,7 @@ class RobotStateBuffer:
         if self._states and t_ns == self._states[-1].t_ns:  # of another publisher
             last = self._states.pop()
             q, v = {**last.q, **q}, {**last.v, **v}
-        self._states.append(_State(t_ns, tuple(q), q, v if len(v) == len(q) else {}))
+        self._states.append(_JointState(t_ns, tuple(q), q, v if len(v) == len(q) else {}))
 
     def set_static(self, parent: str, child: str, T_parent_child: Array) -> None:
         """Add or replace a fixed edge, also one above the root, as of a map; the description's own are ignored.

@@ -78,7 +78,7 @@ class Primitive:
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class VisualMesh:
     """A visual mesh on a link.
 
     Attributes:
@@ -105,7 +105,7 @@ class Link:
     name: str
     collision: tuple[Primitive, ...]
     visual: tuple[Primitive, ...]
-    meshes: tuple[Mesh, ...] = ()
+    meshes: tuple[VisualMesh, ...] = ()
     unread: tuple[str, ...] = ()
 
 
@@ -236,11 +236,11 @@ def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
     return Link(attribute(element, "name"), collision, visual, meshes, unread)
 
 
-def _mesh(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Mesh:
+def _mesh(element: ET.Element, colors: Mapping[str, Rgba | None]) -> VisualMesh:
     mesh = element.find("geometry/mesh")
     assert mesh is not None  # `_primitive` has looked
     scale = floats(mesh.get("scale", "1 1 1"), 3, mesh)
-    return Mesh(mesh.get("filename", ""), tuple(scale), origin(element), _colour(element, colors))
+    return VisualMesh(mesh.get("filename", ""), tuple(scale), origin(element), _colour(element, colors))
 
 
 def _child(element: ET.Element, tag: str, key: str) -> str:

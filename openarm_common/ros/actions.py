@@ -109,7 +109,7 @@ def _participant(info: TopicEndpointInfo) -> str:
     return bytes(info.endpoint_gid[:12]).hex()
 
 
-class Watch:
+class ServerWatch:
     """Notices when a server dies, which discovery says seconds later.
 
     Args:
@@ -241,7 +241,7 @@ class ActionClient(action.ActionClient):
         super().__init__(node, kind, name)
         self.name = name
         topic = f"{node.resolve_topic_name(name)}/_action/status"
-        self._watch = Watch(node, topic, f"the server of {name}")
+        self._watch = ServerWatch(node, topic, f"the server of {name}")
 
     def destroy(self) -> None:
         """Take the client down."""

@@ -22,7 +22,7 @@ from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.fields import check_message
-from openarm_common.ros.actions import ActionClient, Watch, check_alive
+from openarm_common.ros.actions import ActionClient, ServerWatch, check_alive
 from openarm_common.ros.executor import WaitSetExecutor
 
 #: Period of checks that the server is still there, s.
@@ -127,7 +127,7 @@ class BackgroundNode(ContextNode):
         super().__init__(name, domain=domain)
         self._timeout = timeout
         self._clients: dict[str, Any] = {}
-        self._watches: dict[str, Watch] = {}
+        self._watches: dict[str, ServerWatch] = {}
         self._making = threading.Lock()
         self._closing = threading.Event()
         self._ended = ""
@@ -252,7 +252,7 @@ class BackgroundNode(ContextNode):
         return found
 
     def _watch_service(self, service: str) -> Callable[[], str]:
-        """Return a function that says when a node has died that offers a service, as `Watch.begin`."""
+        """Return a function that says when a node has died that offers a service, as `ServerWatch.begin`."""
         begun: list[Callable[[], str]] = []
 
         def died() -> str:
@@ -263,10 +263,10 @@ class BackgroundNode(ContextNode):
         died()
         return died
 
-    def _watch_node(self, name: str) -> Watch:
+    def _watch_node(self, name: str) -> ServerWatch:
         with self._making:
             if name not in self._watches:
-                self._watches[name] = Watch(self._node, "", f"the node {name.rpartition('/')[2]}", name)
+                self._watches[name] = ServerWatch(self._node, "", f"the node {name.rpartition('/')[2]}", name)
             return self._watches[name]
 
     def _client(self, name: str, make: Callable[[], Any]) -> Any:

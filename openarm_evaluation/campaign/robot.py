@@ -48,7 +48,7 @@ from openarm_grasp.perception.detections import Frame, Ids
 from openarm_motion.config import FaultsConfig, MotionConfig
 from openarm_motion.planning.arm import Arm
 from openarm_motion.service.motion_service import MotionService, make_arms, table_box
-from openarm_motion.service.robot import Outcome
+from openarm_motion.service.robot import GoalOutcome
 from openarm_motion.timing.trajectory import Motion
 from openarm_octomap.grid import DepthScan
 from openarm_octomap.mapper import Frame as MapFrame
@@ -455,7 +455,7 @@ class _ArmController:
         try:
             self._follower.start(self._follower.check(points), robot.t_ns, measured, goal.end)
         except TrajectoryError as error:
-            goal.outcome = Outcome(False, f"{error.result.name}: {error.message}")
+            goal.outcome = GoalOutcome(False, f"{error.result.name}: {error.message}")
         return goal
 
 
@@ -466,10 +466,10 @@ class _Goal:
 
     def __init__(self, follower: TrajectoryFollower, since_ns: int) -> None:
         self._follower, self.since_ns = follower, since_ns
-        self.outcome: Outcome | None = None
+        self.outcome: GoalOutcome | None = None
 
     def end(self, outcome: TrajectoryOutcome) -> None:
-        self.outcome = Outcome(outcome.end is End.SUCCEEDED, f"{outcome.result.name}: {outcome.text}")
+        self.outcome = GoalOutcome(outcome.end is End.SUCCEEDED, f"{outcome.result.name}: {outcome.text}")
 
     def cancel(self) -> None:
         if self.outcome is None:

@@ -101,7 +101,7 @@ class Model(NamedTuple):
     edge: Array
 
 
-class Work(NamedTuple):
+class Workspace(NamedTuple):
     """Room for one thread.
 
     Attributes:
@@ -139,11 +139,11 @@ class Work(NamedTuple):
 
 
 @kernel
-def workspace(model: Model) -> Work:
+def workspace(model: Model) -> Workspace:
     """Room for one thread."""
     n, s, c, g = model.parents.shape[0], model.kinds.shape[0], model.clusters.shape[0], model.groups.shape[0]
     world, middles = np.zeros((s, 3, 4)), np.zeros((c, 3))
-    work = Work(
+    work = Workspace(
         unplaced(n),
         world,
         np.zeros(s + 1, np.int64),
@@ -177,7 +177,7 @@ def workspace(model: Model) -> Work:
 
 
 @inner_kernel
-def map_room(m: int, enough: float, model: Model, work: Work) -> float:
+def map_room(m: int, enough: float, model: Model, work: Workspace) -> float:
     """By how much a body is further from the map than it must be; searched until it is `enough`."""
     groups, spheres, shapes, keeps = model.sphere_groups, model.spheres, model.sphere_shapes, model.sphere_keep
     field, corner, edge = model.field, model.corner, model.edge
@@ -243,7 +243,7 @@ _CLOSE = 0.03
 
 
 @inner_kernel
-def place(q: Array, model: Model, work: Work) -> None:
+def place(q: Array, model: Model, work: Workspace) -> None:
     """Bring bodies and the centres of what moves with them to where they are in a state."""
     # fields are unpacked before loops here and below: each access costs a count of references
     frames, middles, parents, placements, axes = work.frames, work.middles, model.parents, model.placements, model.axes
@@ -258,8 +258,8 @@ def place(q: Array, model: Model, work: Work) -> None:
 
 
 @inner_kernel
-def sway(a: Array, b: Array, share: float, model: Model, work: Work) -> None:
-    """Fill `Work.sways` about the state that bodies were placed for, for a share of the line from `a` to `b` (n,).
+def sway(a: Array, b: Array, share: float, model: Model, work: Workspace) -> None:
+    """Fill `Workspace.sways` about the state that bodies were placed for, for a share of the line from `a` to `b` (n,).
 
     Joints turn one after the other, the last one first: each moves a point by no more than its turn times the distance
     from its axis, to which what the joints before have moved it is added.
@@ -296,11 +296,11 @@ def sway(a: Array, b: Array, share: float, model: Model, work: Work) -> None:
 
 
 @inner_kernel
-def sift(sways: Array, model: Model, work: Work) -> int:
+def sift(sways: Array, model: Model, work: Workspace) -> int:
     """List the groups whose balls may come too near in an interval; returns how many. Bodies in the map are added.
 
     Args:
-        sways: `Work.sways` of the interval, or `Work.still`.
+        sways: `Workspace.sways` of the interval, or `Workspace.still`.
         model: The scene.
         work: Room.
     """
@@ -329,7 +329,7 @@ def sift(sways: Array, model: Model, work: Work) -> int:
 
 
 @inner_kernel
-def check_listed(start: int, count: int, end: int, sways: Array, model: Model, work: Work) -> int:
+def check_listed(start: int, count: int, end: int, sways: Array, model: Model, work: Workspace) -> int:
     """Check listed groups (and bodies in the map) in the state that bodies were placed for.
 
     Args:
@@ -426,7 +426,7 @@ def check_listed(start: int, count: int, end: int, sways: Array, model: Model, w
 
 
 @bare_kernel
-def near(q: Array, model: Model, work: Work) -> bool:
+def near(q: Array, model: Model, work: Workspace) -> bool:
     """Whether in a state (n,) something is not proven to be as far from all else as it must be."""
     place(q, model, work)
     return check_listed(0, sift(work.still, model, work), -1, work.still, model, work) < 0

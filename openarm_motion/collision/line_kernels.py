@@ -12,17 +12,17 @@ import math
 
 from openarm_common.kernels import bare_kernel, inner_kernel
 from openarm_common.types import Array
-from openarm_motion.collision.clearance_kernels import Model, Work, check_listed, near, place, sift, sway
+from openarm_motion.collision.clearance_kernels import Model, Workspace, check_listed, near, place, sift, sway
 
 
 @bare_kernel
-def line_free(a: Array, b: Array, step: float, travel: float, levers: Array, model: Model, work: Work) -> bool:
+def line_free(a: Array, b: Array, step: float, travel: float, levers: Array, model: Model, work: Workspace) -> bool:
     """Whether the joint line from `a` to `b` is free at steps as the exact layer takes them, the ends included."""
     return not (near(b, model, work) or near(a, model, work)) and between_free(a, b, step, travel, levers, model, work)
 
 
 @inner_kernel
-def between_free(a: Array, b: Array, step: float, travel: float, levers: Array, model: Model, work: Work) -> bool:
+def between_free(a: Array, b: Array, step: float, travel: float, levers: Array, model: Model, work: Workspace) -> bool:
     """As `line_free`, but for the ends."""
     largest, way = 0.0, 0.0
     for i in range(a.shape[0]):

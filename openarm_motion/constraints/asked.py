@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from openarm_common.types import Array
-from openarm_motion.constraints.regions import Region
+from openarm_motion.constraints.regions import TaskRegion
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,8 +19,8 @@ class RegionGoal:
         time_limit: Time limit of the search, s; 0: the default.
     """
 
-    regions: tuple[Region, ...]
-    path: Region = field(default_factory=Region)
+    regions: tuple[TaskRegion, ...]
+    path: TaskRegion = field(default_factory=TaskRegion)
     time_limit: float = 0.0
 
 
@@ -42,4 +42,4 @@ class CartesianGoal:
     revolute_jump: float = 0.0
     jump_factor: float = 0.0
     avoid_collisions: bool = True
-    path: Region = field(default_factory=Region)
+    path: TaskRegion = field(default_factory=TaskRegion)

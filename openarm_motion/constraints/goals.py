@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from openarm_common.errors import Code
 from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
-from openarm_motion.constraints.regions import PositionRegion, Region
+from openarm_motion.constraints.regions import PositionRegion, TaskRegion
 from openarm_motion.planning.arm import Arm, Scale, segment_time
 from openarm_motion.planning.failure import PlanFailedError
 
@@ -24,7 +24,7 @@ _DRAWS = 48
 _ANYWHERE = 0.35
 
 
-def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0, end: float = math.inf) -> list[Array]:
+def in_region(arm: Arm, region: TaskRegion, start: Array, scale: Scale = 0.0, end: float = math.inf) -> list[Array]:
     """Configurations (n,) in a region, those that are reached first come first.
 
     Args:
@@ -58,7 +58,7 @@ def in_region(arm: Arm, region: Region, start: Array, scale: Scale = 0.0, end: f
     raise PlanFailedError(Code.UNREACHABLE, f"{arm.name} arm can't reach the goal: {why}", "goal")
 
 
-def _joints(arm: Arm, region: Region, start: Array) -> Array:
+def _joints(arm: Arm, region: TaskRegion, start: Array) -> Array:
     """The middle of the intervals, moved into the limits as far as the tolerances allow."""
     q = start.copy()
     for interval in region.joints:
@@ -68,7 +68,7 @@ def _joints(arm: Arm, region: Region, start: Array) -> Array:
     return nearest_turns(arm.configuration(q, "goal", 1e-3), start, arm.upper)
 
 
-def _poses(arm: Arm, region: Region, start: Array) -> Iterator[tuple[Array, bool]]:
+def _poses(arm: Arm, region: TaskRegion, start: Array) -> Iterator[tuple[Array, bool]]:
     """Poses (4, 4) of the tool to try, and whether their orientation is free."""
     rng = np.random.default_rng(arm.config.planning.seed)
     here = arm.kinematics.fk(start)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from openarm_common.errors import Code
 from openarm_common.types import Array
 from openarm_motion.collision.line_checks import LineChecks
-from openarm_motion.constraints.regions import Region
+from openarm_motion.constraints.regions import TaskRegion
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.timing.trajectory import Trajectory
 from openarm_motion.timing.validation import dense_times, validate_trajectory
@@ -37,7 +37,7 @@ class ConstrainedLines(LineChecks):
 
     exact_only = True
 
-    def __init__(self, arm: Arm, scene: CollisionScene, region: Region) -> None:
+    def __init__(self, arm: Arm, scene: CollisionScene, region: TaskRegion) -> None:
         region.check(arm.names)
         self._arm, self._scene, self._region = arm, scene, region
         self.levers = scene.levers

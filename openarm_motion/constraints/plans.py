@@ -20,7 +20,7 @@ from openarm_motion.collision.exact import CollisionScene
 from openarm_motion.constraints.asked import RegionGoal
 from openarm_motion.constraints.goals import in_region
 from openarm_motion.constraints.lines import ConstrainedLines
-from openarm_motion.constraints.regions import Region
+from openarm_motion.constraints.regions import TaskRegion
 from openarm_motion.kinematics.line import solve_line
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.failure import PlanFailedError
@@ -68,7 +68,7 @@ def _end(arm: Arm, goal: RegionGoal) -> float:
     return time.monotonic() + (goal.time_limit or arm.config.planning.time_limit)
 
 
-def _configurations(arm: Arm, now: StartState, regions: Sequence[Region], end: float) -> list[Array]:
+def _configurations(arm: Arm, now: StartState, regions: Sequence[TaskRegion], end: float) -> list[Array]:
     found: list[Array] = []
     fault: OpenArmError | None = None
     for region in regions:
@@ -82,7 +82,7 @@ def _configurations(arm: Arm, now: StartState, regions: Sequence[Region], end: f
 
 
 def _constrained(
-    arm: Arm, now: StartState, scene: CollisionScene, free: Sequence[Array], path: Region, end: float
+    arm: Arm, now: StartState, scene: CollisionScene, free: Sequence[Array], path: TaskRegion, end: float
 ) -> Trajectory:
     lines = ConstrainedLines(arm, scene, path)
     if text := lines.fault(now.start):

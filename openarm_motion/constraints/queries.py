@@ -15,14 +15,14 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_motion.collision.exact import Contact
 from openarm_motion.constraints.goals import in_region
-from openarm_motion.constraints.regions import OrientationRegion, PositionRegion, Region, Volume
+from openarm_motion.constraints.regions import OrientationRegion, PositionRegion, TaskRegion, Volume
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.moves import RequestBoxes
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class StateVerdict:
     """Whether a configuration is one that a plan may end in, and why not.
 
     Attributes:
@@ -41,15 +41,21 @@ class Verdict:
         return not self.contacts and not self.limits and all(beyond == 0.0 for _, beyond in self.constraints)
 
 
-def at_pose(pose: Array, more: Region) -> Region:
+def at_pose(pose: Array, more: TaskRegion) -> TaskRegion:
     """The configurations with the tool at a pose (4, 4), in another region, too."""
     place = PositionRegion("the tool", np.zeros(3), (Volume("sphere", pose, (0.0,)),))
     turn = OrientationRegion("the tool", np.eye(3), pose[:3, :3], (0.0, 0.0, 0.0))
-    return Region(more.joints, (place, *more.positions), (turn, *more.orientations))
+    return TaskRegion(more.joints, (place, *more.positions), (turn, *more.orientations))
 
 
 def solve(
-    arm: Arm, now: StartState, around: RequestBoxes, region: Region, *, avoid_collisions: bool, end: float = math.inf
+    arm: Arm,
+    now: StartState,
+    around: RequestBoxes,
+    region: TaskRegion,
+    *,
+    avoid_collisions: bool,
+    end: float = math.inf,
 ) -> Array:
     """The configuration (n,) in a region that is reached first; without collisions, where they count.
 
@@ -76,7 +82,7 @@ def solve(
     return free
 
 
-def judge(arm: Arm, now: StartState, around: RequestBoxes, region: Region) -> Verdict:
+def judge(arm: Arm, now: StartState, around: RequestBoxes, region: TaskRegion) -> StateVerdict:
     """Judge where an arm is.
 
     Raises:
@@ -88,7 +94,7 @@ def judge(arm: Arm, now: StartState, around: RequestBoxes, region: Region) -> Ve
     pose = arm.kinematics.fk(now.start)
     outside = region.outside(arm.names, now.start[None], pose[None])
     parts = tuple((what, weight * float(b[0])) for (what, b), weight in zip(outside, region.weights, strict=True))
-    return Verdict(contacts, parts)
+    return StateVerdict(contacts, parts)
 
 
 def link_poses(

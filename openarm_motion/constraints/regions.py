@@ -29,7 +29,7 @@ class JointInterval:
     """Position of a joint, and how far it may be above and below, rad or m.
 
     Attributes:
-        weight: Same as in `Region.weights`.
+        weight: Same as in `TaskRegion.weights`.
         upper: Upper limit of the joint; infinite where whole turns make no difference.
     """
 
@@ -141,7 +141,7 @@ class OrientationRegion:
 
 
 @dataclass(frozen=True, eq=False)
-class Region:
+class TaskRegion:
     """Configurations that satisfy all of these."""
 
     joints: tuple[JointInterval, ...] = ()

@@ -58,7 +58,7 @@ class IkResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class IkSolution:
     """One configuration (n,) of the arm at a pose, and what singles it out among the others.
 
     Attributes:

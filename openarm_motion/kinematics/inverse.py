@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
-from openarm_motion.kinematics.chain import ArmKinematics, IkResult, Solution
+from openarm_motion.kinematics.chain import ArmKinematics, IkResult, IkSolution
 from openarm_motion.kinematics.srs import SrsArm, SrsMiss
 
 #: Numeric solutions nearer to each other than this in every joint count as one.
@@ -31,7 +31,7 @@ _OUT_OF_REACH, _ROUNDED = 4, 1e-3
 class _Search:
     """What was found at a pose; where nothing was, the nearest that is within the limits, and what is in the way."""
 
-    found: list[Solution]
+    found: list[IkSolution]
     nearest: IkResult | None = None
     miss: SrsMiss | None = None
 
@@ -54,7 +54,7 @@ class InverseKinematics:
             self._closed = None
             self.method = f"numeric ({error.message})"
 
-    def solutions(self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None) -> list[Solution]:
+    def solutions(self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None) -> list[IkSolution]:
         """Configurations at a pose within the limits less `margin`.
 
         Args:
@@ -65,7 +65,7 @@ class InverseKinematics:
         """
         return self._search(pose, margin, near).found
 
-    def position_solutions(self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None) -> list[Solution]:
+    def position_solutions(self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None) -> list[IkSolution]:
         """Configurations whose tool origin is at the position of `pose`, in whatever orientation."""
         return self._search(pose, margin, near, position_only=True).found
 
@@ -87,10 +87,10 @@ class InverseKinematics:
         best = min(found, key=lambda solution: float(np.max(np.abs(solution.q - here))))
         return arm.ik(pose, best.q, position_only=position_only, margin=margin, restarts=0)
 
-    def classify(self, q: ArrayLike) -> Solution:
+    def classify(self, q: ArrayLike) -> IkSolution:
         """Swivel angle and branch of a configuration."""
         values = np.asarray(q, dtype=np.float64)
-        return Solution(values) if self._closed is None else self._closed.classify(values)
+        return IkSolution(values) if self._closed is None else self._closed.classify(values)
 
     def why_not(
         self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None, *, position_only: bool = False
@@ -111,7 +111,7 @@ class InverseKinematics:
         return "; ".join(reason for reason in reasons if reason)
 
     def follow(
-        self, poses: Array, start: Solution, margin: float, max_step: float, swivel_change: float = 0.0
+        self, poses: Array, start: IkSolution, margin: float, max_step: float, swivel_change: float = 0.0
     ) -> tuple[Array, int, str]:
         """Configurations along a path of poses (m, 4, 4), on the branch of `start`.
 
@@ -167,7 +167,7 @@ class InverseKinematics:
         solved = [closed.classify(result.q) for result in results if result.success]
         return _Search(self._near(solved, near), replace(best, q=self._turned(best.q, near)), miss)
 
-    def _near(self, found: list[Solution], near: ArrayLike | None) -> list[Solution]:
+    def _near(self, found: list[IkSolution], near: ArrayLike | None) -> list[IkSolution]:
         """The same configurations, in the turns nearest to another one."""
         if not np.isinf(self.kinematics.upper).any():
             return found
@@ -181,9 +181,9 @@ class InverseKinematics:
         if found:
             return _Search(found)
         result = self.kinematics.ik(pose, near, position_only=position_only, margin=margin)
-        return _Search([Solution(result.q)] if result.success else [], result)
+        return _Search([IkSolution(result.q)] if result.success else [], result)
 
-    def _several(self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool) -> list[Solution]:
+    def _several(self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool) -> list[IkSolution]:
         """What a few guesses lead to, each once."""
         arm = self.kinematics
         if arm.beyond(pose, _ROUNDED):
@@ -191,12 +191,12 @@ class InverseKinematics:
         rng = np.random.default_rng(0)
         seeds = [] if near is None else [np.asarray(near, dtype=np.float64)]
         seeds += [arm.middle, *rng.uniform(*arm.span, (_GUESSES, arm.n))]
-        found: list[Solution] = []
+        found: list[IkSolution] = []
         for seed in seeds:
             result = arm.ik(pose, seed, position_only=position_only, margin=margin, restarts=0)
             q = self._turned(result.q, near)
             if result.success and all(float(np.max(np.abs(q - s.q))) > _SAME for s in found):
-                found.append(Solution(q))
+                found.append(IkSolution(q))
         return found
 
     def _binding(self, miss: SrsMiss, closed: SrsArm) -> str:

@@ -15,7 +15,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.exact import CollisionScene, Contact
-from openarm_motion.kinematics.chain import Solution
+from openarm_motion.kinematics.chain import IkSolution
 from openarm_motion.kinematics.chain_kernels import ROTATION_LENGTH
 from openarm_motion.kinematics.inverse import InverseKinematics
 
@@ -65,7 +65,7 @@ def line_poses(T_a: Array, T_b: Array) -> tuple[Array, Array]:
 
 def solve_line(
     inverse: InverseKinematics,
-    start: Solution,
+    start: IkSolution,
     T_start: Array,
     T_end: Array,
     margin: float,

@@ -17,7 +17,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.kinematics import srs_intervals, srs_kernels
-from openarm_motion.kinematics.chain import ArmKinematics, Solution, digits
+from openarm_motion.kinematics.chain import ArmKinematics, IkSolution, digits
 
 #: How far the axes may miss each other: a rounded rpy in the URDF costs 4e-6 m.
 _MEET = 2e-5
@@ -70,20 +70,20 @@ class SrsArm:
         status = srs_kernels.solve(_c(pose), swivel, branch, self._geometry, self._tool, self._lower, self._upper, q)
         return q if status == 0 else None
 
-    def sweep(self, pose: Array, swivels: Array, margin: float = 0.0) -> list[Solution]:
+    def sweep(self, pose: Array, swivels: Array, margin: float = 0.0) -> list[IkSolution]:
         """Configurations within the limits less `margin`: all at `swivels` (k,), and one in each interval between."""
         rows = srs_kernels.BRANCHES * (swivels.size + srs_intervals.MOST)
         found, at, branch = np.empty((rows, 7)), np.empty(rows), np.empty(rows, dtype=np.int64)
         lower, upper = self._lower + margin, self._upper - margin
         count, _ = srs_intervals.sweep(_c(pose), swivels, self._geometry, self._tool, lower, upper, found, at, branch)
         if count:
-            return [Solution(*of) for of in zip(found[:count].copy(), at.tolist(), branch.tolist(), strict=False)]
+            return [IkSolution(*of) for of in zip(found[:count].copy(), at.tolist(), branch.tolist(), strict=False)]
         # what is left are intervals that are points
         best, at, least, status = self._nearest(pose, swivels, margin)
         if status:
             return []
         kept = np.flatnonzero(least <= srs_intervals.ROUNDING)
-        return [Solution(np.clip(best[i], lower, upper), float(at[i]), int(i)) for i in kept]
+        return [IkSolution(np.clip(best[i], lower, upper), float(at[i]), int(i)) for i in kept]
 
     def miss(self, pose: Array, swivels: Array, margin: float = 0.0) -> SrsMiss:
         """What is in the way of a pose that `sweep` finds nothing for."""
@@ -100,7 +100,7 @@ class SrsArm:
         return SrsMiss(excess, best[order[np.isfinite(least[order])]])
 
     def follow(
-        self, poses: Array, swivels: Array, start: Solution, margin: float, max_step: float
+        self, poses: Array, swivels: Array, start: IkSolution, margin: float, max_step: float
     ) -> tuple[Array, int, str]:
         """Configurations (m, 7) along poses (m, 4, 4) at swivel angles (m,), on the branch of `start`.
 
@@ -134,7 +134,7 @@ class SrsArm:
         """Swivel angle of a configuration (7,), rad."""
         return float(srs_kernels.swivel_of(_c(q), self._geometry))
 
-    def classify(self, q: ArrayLike) -> Solution:
+    def classify(self, q: ArrayLike) -> IkSolution:
         """Swivel angle and branch of a configuration."""
         values = np.ascontiguousarray(q, dtype=np.float64)
         swivel = self.swivel(values)
@@ -147,7 +147,7 @@ class SrsArm:
             distance = float(np.max(np.abs(nearest_turns(candidate, values, np.inf) - values)))
             if distance < least:
                 best, least = branch, distance
-        return Solution(values, swivel, best)
+        return IkSolution(values, swivel, best)
 
     def distance_text(self, excess: float) -> str:
         """Sentence about a wrist that is too far away (`excess` > 0, m) or too near (< 0)."""

@@ -21,7 +21,7 @@ from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
 from openarm_motion.collision.exact import CollisionScene, Contact
 from openarm_motion.collision.solids import Box
-from openarm_motion.kinematics.chain import Solution
+from openarm_motion.kinematics.chain import IkSolution
 from openarm_motion.kinematics.line import Line, line_contact, solve_line
 from openarm_motion.planning.arm import Arm, StartState, first_contact, segment_time
 from openarm_motion.planning.failure import PlanFailedError, Stage
@@ -368,7 +368,7 @@ class _Checks:
         text = f"{target.id}: {worst.message} ({len(faults)} configurations tried)"
         return [], Refused.of(target.id, worst, text)
 
-    def _lines(self, target: Target, solution: Solution) -> tuple[Line, Line]:
+    def _lines(self, target: Target, solution: IkSolution) -> tuple[Line, Line]:
         """Both lines of a configuration at the target, free of collision.
 
         Raises:
@@ -403,7 +403,7 @@ class _Checks:
             for box in self._request.attached:
                 self._retreat.place(box.id, pose @ box.T)
 
-    def _cost(self, solution: Solution, travel: float) -> float:
+    def _cost(self, solution: IkSolution, travel: float) -> float:
         """Seconds of travel, and up to one more for a configuration near to a joint limit."""
         return travel + 1.0 - min(self._arm.kinematics.margin(solution.q), _COMFORT) / _COMFORT
 

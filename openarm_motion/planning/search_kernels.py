@@ -9,7 +9,7 @@ import numpy as np
 
 from openarm_common.kernels import bare_kernel, inner_kernel, kernel
 from openarm_common.types import Array, Ints
-from openarm_motion.collision.clearance_kernels import Model, Work, near
+from openarm_motion.collision.clearance_kernels import Model, Workspace, near
 from openarm_motion.collision.line_kernels import between_free, line_free
 
 #: Two configurations nearer than this are one, rad.
@@ -72,7 +72,7 @@ def grow(
     resolution: Array,
     levers: Array,
     model: Model,
-    work: Work,
+    work: Workspace,
     iterations: int,
     seed: int,
 ) -> tuple[int, int, int]:
@@ -168,7 +168,7 @@ def duration(a: Array, b: Array, limits: Array) -> float:
 
 
 @kernel
-def _skip(points: Array, count: int, resolution: Array, levers: Array, model: Model, work: Work) -> int:
+def _skip(points: Array, count: int, resolution: Array, levers: Array, model: Model, work: Workspace) -> int:
     """Go from each way point to the furthest one that a free line reaches; returns how many are left."""
     i, kept = 0, 1
     while i < count - 1:
@@ -191,7 +191,7 @@ def shorten(
     resolution: Array,
     levers: Array,
     model: Model,
-    work: Work,
+    work: Workspace,
 ) -> int:
     """Make a path faster in place: leave way points out, cut corners, pull way points towards their neighbours.
 

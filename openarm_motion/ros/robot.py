@@ -27,7 +27,7 @@ from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
 from openarm_motion.config import ExecutionConfig, MotionConfig
-from openarm_motion.service.robot import Outcome
+from openarm_motion.service.robot import GoalOutcome
 from openarm_motion.timing.trajectory import Motion
 
 T = TypeVar("T")
@@ -137,7 +137,7 @@ class Controller:
         """Whether its action is in the graph."""
         return self._client.server_is_ready()
 
-    def start(self, motion: Motion, begin_ns: int, *, touches: bool) -> _Goal:
+    def start(self, motion: Motion, begin_ns: int, *, touches: bool) -> _SentGoal:
         """Send a trajectory; its stamp is where it begins. The arm holds when this process dies or hangs."""
         message = trajectory_to_msg(motion.names, motion.t, motion.q, motion.v, motion.a)
         message.header.stamp = ns_to_stamp(begin_ns)
@@ -149,13 +149,13 @@ class Controller:
             near = self._execution.goal_tolerance
             goal.goal_tolerance = [JointTolerance(name=name, position=near) for name in motion.names]
             goal.goal_time_tolerance = Duration(seconds=self._execution.settle).to_msg()
-        sent = _Goal(lifeline)
+        sent = _SentGoal(lifeline)
         answer = self._client.send_goal_async(goal, feedback_callback=sent.on_feedback, goal_uuid=info.goal_id)
         answer.add_done_callback(sent.on_answer)
         return sent
 
 
-class _Goal:
+class _SentGoal:
     """A goal that was sent; one that is withdrawn before it is accepted is cancelled when it is."""
 
     def __init__(self, lifeline: Lifeline) -> None:
@@ -174,7 +174,7 @@ class _Goal:
         return self._since_ns
 
     @property
-    def outcome(self) -> Outcome | None:
+    def outcome(self) -> GoalOutcome | None:
         if self._ended is None or not self._ended.done():
             return None
         answer: Any = self._ended.result()
@@ -182,7 +182,7 @@ class _Goal:
         fault = _FAULTS.get(result.error_code, str(result.error_code))
         reason = f": {result.error_string}" if result.error_string else ""
         code = Code.STOPPED if result.error_code == _STOPPED else Code.EXECUTION_FAILED
-        return Outcome(result.error_code == _RESULT.SUCCESSFUL, fault + reason, code)
+        return GoalOutcome(result.error_code == _RESULT.SUCCESSFUL, fault + reason, code)
 
     def cancel(self) -> None:
         self._withdrawn = True

@@ -23,15 +23,14 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.pacing import Pacer, PeriodMeter
 from openarm_common.ros.convert import joints_from_msg, ns_to_stamp, stamp_to_ns, trajectory_to_msg
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_common.ros.polled import Polled, Source
-from openarm_motion.config import ServoConfig
-from openarm_motion.servo.arm_servo import Report, Status
-from openarm_motion.servo.servo import Servo
+from openarm_motion.config import NoParameters, ServoingConfig
+from openarm_motion.servo.arm_servo import ServoReport, ServoState
+from openarm_motion.servo.servo import Servoing
 from openarm_motion.timing.trajectory import Motion
 
 if TYPE_CHECKING:
@@ -47,10 +46,6 @@ _SWITCH = 0.0005
 _TYPES = {ServoCommandType.Request.JOINT_JOG: "joint jog", ServoCommandType.Request.TWIST: "twist"}
 
 
-class NoParameters(Config):
-    """The parameters are those of the motion node, `servo.*`."""
-
-
 class ServoNode(BaseNode[NoParameters]):
     """Servoing over ROS.
 
@@ -64,13 +59,13 @@ class ServoNode(BaseNode[NoParameters]):
     def __init__(
         self,
         service: MotionService,
-        config: ServoConfig,
+        config: ServoingConfig,
         controller: str,
         check_hold: Callable[[str, bytes], None],
         **kwargs: Any,
     ) -> None:
         super().__init__("servo_node", NoParameters, use_global_arguments=False, **kwargs)
-        self.servo = Servo(service, config, self._send)
+        self.servo = Servoing(service, config, self._send)
         self._period_ns, self.check_hold = round(config.publish_period * 1e9), check_hold
         names = self.servo.names
         topic = f"{controller.rpartition('/')[0]}/joint_trajectory"
@@ -82,7 +77,7 @@ class ServoNode(BaseNode[NoParameters]):
             self._ends += [_End(self, f"/{arm}", (arm,)) for arm in names]
         self._states = Polled(self, Source(JointState, "/joint_states", QOS_COMMAND))
         self._periods, self._refreshing, self._closing = PeriodMeter(), False, threading.Event()
-        self._said: dict[str, Report] = {}
+        self._said: dict[str, ServoReport] = {}
         self.create_timer(_REFRESH, self._refresh, clock=self.steady_clock)  # pyright: ignore[reportArgumentType]
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
         self._thread = threading.Thread(target=self._run, name="servo", daemon=True)
@@ -94,7 +89,7 @@ class ServoNode(BaseNode[NoParameters]):
         self._thread.join(timeout=1.0)
         super().close()
 
-    def tell(self, arm: str, report: Report) -> None:
+    def tell(self, arm: str, report: ServoReport) -> None:
         """Publish what an arm does."""
         message = ServoStatus(code=int(report.status), message=report.text)
         for end in self._ends:
@@ -166,7 +161,7 @@ class ServoNode(BaseNode[NoParameters]):
     def _report(self) -> None:
         period = self._periods.figures()
         reports = self.servo.reports()
-        halted = [one.text for one in reports.values() if one.status is Status.INVALID]
+        halted = [one.text for one in reports.values() if one.status is ServoState.INVALID]
         self.diagnose(
             not halted,
             "; ".join(halted) or ("servoing" if self.servo.started else "not started"),
@@ -263,7 +258,7 @@ class _End:
         try:
             take()
         except OpenArmError as error:
-            self.status.publish(ServoStatus(code=int(Status.INVALID), message=f"{error.code}: {error.message}"))
+            self.status.publish(ServoStatus(code=int(ServoState.INVALID), message=f"{error.code}: {error.message}"))
             self._node.refuse(f"{self._name}/{topic}", error)
 
     def _check_type(self, given: int) -> None:

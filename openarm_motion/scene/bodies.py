@@ -25,47 +25,47 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class SceneBody:
     """A body: its own frame `T` (4, 4), and shapes in the frame that `T` is in."""
 
     id: str
     T: Array
     shapes: tuple[Solid, ...]
 
-    def moved(self, by: Array) -> Body:
+    def moved(self, by: Array) -> SceneBody:
         """The body in another frame, or elsewhere: all poses times `by` (4, 4)."""
-        return Body(self.id, by @ self.T, tuple(replace(shape, T=by @ shape.T) for shape in self.shapes))
+        return SceneBody(self.id, by @ self.T, tuple(replace(shape, T=by @ shape.T) for shape in self.shapes))
 
-    def named(self) -> Body:
+    def named(self) -> SceneBody:
         """The body with the names of its shapes that the scene knows it by."""
         many = len(self.shapes) > 1
         names = [part_name(self.id, k) if many else self.id for k in range(len(self.shapes))]
         shapes = tuple(replace(shape, id=name) for shape, name in zip(self.shapes, names, strict=True))
-        return Body(self.id, self.T, shapes)
+        return SceneBody(self.id, self.T, shapes)
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class HeldBody:
     """A body that an arm's hand holds, in the frame of the tool."""
 
     arm: str
-    body: Body
+    body: SceneBody
 
 
 @dataclass(eq=False)
-class Draft:
+class SceneDraft:
     """A change of the scene, and of what hands hold, before it is in force."""
 
-    world: dict[str, Body]
-    held: dict[str, Held]
+    world: dict[str, SceneBody]
+    held: dict[str, HeldBody]
     allowed: frozenset[frozenset[str]]
     changed: set[str] = field(default_factory=set[str])
 
-    def put(self, body: Body, *, append: bool = False) -> None:
+    def put(self, body: SceneBody, *, append: bool = False) -> None:
         """Add a body, replace it, or append shapes to it."""
         if append and body.id in self.world:
             there = self.world[body.id]
-            body = Body(body.id, there.T, (*there.shapes, *body.shapes))
+            body = SceneBody(body.id, there.T, (*there.shapes, *body.shapes))
         self.world[body.id] = body
         self.changed.add(body.id)
 
@@ -83,11 +83,11 @@ class Draft:
         self._there(id)
         del self.world[id]
 
-    def attach(self, id: str, arm: str, T_base_tool: Array, shapes: Body | None) -> None:
+    def attach(self, id: str, arm: str, T_base_tool: Array, shapes: SceneBody | None) -> None:
         """Let a hand hold a body of the scene, or one that is given, base frame."""
         body = shapes if shapes is not None else self._there(id)
         self.world.pop(id, None)
-        self.held[id] = Held(arm, body.moved(se3.inverse(T_base_tool)))
+        self.held[id] = HeldBody(arm, body.moved(se3.inverse(T_base_tool)))
 
     def detach(self, id: str, T_base_tool: Array) -> None:
         """Put a body that a hand holds where it is now."""
@@ -95,7 +95,7 @@ class Draft:
             raise _unknown(id, self.held, "in a hand")
         self.put(self.held.pop(id).body.moved(T_base_tool))
 
-    def _there(self, id: str) -> Body:
+    def _there(self, id: str) -> SceneBody:
         if id not in self.world:
             raise _unknown(id, self.world, "in the scene")
         return self.world[id]
@@ -111,20 +111,20 @@ class SceneBodies:
     def __init__(self, service: MotionService) -> None:
         self._service = service
         self._frames: dict[str, Array] = {}
-        self._held: dict[str, Held] = {}
+        self._held: dict[str, HeldBody] = {}
 
     @property
-    def world(self) -> dict[str, Body]:
+    def world(self) -> dict[str, SceneBody]:
         """Bodies of the scene but for the fixed ones."""
         parts: dict[str, list[Solid]] = {}
         for solid in self._service.scene.solids:
             parts.setdefault(body_of(solid.id), []).append(solid)
-        return {id: Body(id, self._frames.get(id, solids[0].T), tuple(solids)) for id, solids in parts.items()}
+        return {id: SceneBody(id, self._frames.get(id, solids[0].T), tuple(solids)) for id, solids in parts.items()}
 
     @property
-    def held(self) -> dict[str, Held]:
+    def held(self) -> dict[str, HeldBody]:
         """What the hands hold; of what was not attached here, the boxes that plans carry."""
-        out: dict[str, Held] = {}
+        out: dict[str, HeldBody] = {}
         for arm, boxes in self._service.memory.held.items():
             for box in boxes:
                 id = body_of(box.id)
@@ -133,14 +133,14 @@ class SceneBodies:
                     out[id] = mine
                 else:
                     known = out[id].body.shapes if id in out else ()
-                    out[id] = Held(arm, Body(id, box.T, (*known, box)))
+                    out[id] = HeldBody(arm, SceneBody(id, box.T, (*known, box)))
         return out
 
-    def draft(self) -> Draft:
+    def draft(self) -> SceneDraft:
         """A change that begins with what is."""
-        return Draft(self.world, self.held, self._service.scene.allowed)
+        return SceneDraft(self.world, self.held, self._service.scene.allowed)
 
-    def apply(self, draft: Draft) -> None:
+    def apply(self, draft: SceneDraft) -> None:
         """Put a change in force.
 
         Raises:
@@ -163,7 +163,7 @@ class SceneBodies:
             self._service.coordination.hold(arm, boxes)
 
 
-def boxes_about(body: Body) -> list[Box]:
+def boxes_about(body: SceneBody) -> list[Box]:
     """The box about each shape."""
     out: list[Box] = []
     for shape in body.named().shapes:
@@ -172,6 +172,6 @@ def boxes_about(body: Body) -> list[Box]:
     return out
 
 
-def _unknown(id: str, there: Sequence[str] | dict[str, Body] | dict[str, Held], where: str) -> OpenArmError:
+def _unknown(id: str, there: Sequence[str] | dict[str, SceneBody] | dict[str, HeldBody], where: str) -> OpenArmError:
     names = ", ".join(there) or "none"
     return OpenArmError(Code.UNKNOWN_OBJECT, f"object {id!r} is not {where}; objects {where}: {names}")

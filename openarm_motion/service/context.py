@@ -18,10 +18,10 @@ from openarm_motion.planning.planner import never
 from openarm_motion.scene.held import HeldObjects
 from openarm_motion.scene.map_view import MapState, MapView, unexplained
 from openarm_motion.scene.planning_scene import PlanningScene
-from openarm_motion.service.robot import RobotInterface, Watch, stale
+from openarm_motion.service.robot import RobotInterface, RobotWatch, stale
 
 if TYPE_CHECKING:
-    from openarm_motion.service.coordination import ArmCoordination
+    from openarm_motion.service.coordination import DelayCoordination
 
 #: Next to an arm under way plans keep this distance from where it will end, m: more than what is then proven.
 _NEXT_TO = 0.035
@@ -78,7 +78,7 @@ class PlanningContext:
         arms: Mapping[str, Arm],
         scene: PlanningScene,
         held: HeldObjects,
-        coordination: ArmCoordination,
+        coordination: DelayCoordination,
         map_view: MapView,
         config: MotionConfig,
     ) -> None:
@@ -163,9 +163,9 @@ class PlanningContext:
         return arm.start_state(state, start, scale, stopped)
 
     async def fresh(self) -> None:
-        """Wait a moment for a fresh joint state; see `Watch.fresh`."""
+        """Wait a moment for a fresh joint state; see `RobotWatch.fresh`."""
         if self._robot.state_age() > self._config.execution.stale_after:
-            await Watch(self._robot).fresh()
+            await RobotWatch(self._robot).fresh()
 
     def _slowed(self, arms: Sequence[Arm], scale: Scale) -> Scale:
         """Velocity scale with which no joint is faster than a controller of the arms follows now."""

@@ -14,7 +14,7 @@ from openarm_motion.collision.solids import Box
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.coordination import ActiveMotion, least_delay
 from openarm_motion.scene.held import HeldObjects
-from openarm_motion.service.follower import TrajectoryFollower
+from openarm_motion.service.follower import MotionFollower
 from openarm_motion.service.robot import RobotInterface
 from openarm_motion.timing.checks import check_against_others, check_trajectory
 from openarm_motion.timing.trajectory import Motion
@@ -28,7 +28,7 @@ _SEND = 0.03
 _NOMINAL = 0.03
 
 
-class ArmCoordination:
+class DelayCoordination:
     """Executes motions of arms that share the workspace.
 
     Args:
@@ -42,7 +42,7 @@ class ArmCoordination:
         self, robot: RobotInterface, arms: Mapping[str, Arm], held: HeldObjects, on_held: Callable[[], None]
     ) -> None:
         self._robot, self._arms, self._held, self._on_held = robot, arms, held, on_held
-        self.followers = {name: TrajectoryFollower(robot, arm) for name, arm in arms.items()}
+        self.followers = {name: MotionFollower(robot, arm) for name, arm in arms.items()}
         #: How often each arm has stopped on its way.
         self.stops = dict.fromkeys(arms, 0)
         self._starting = False
@@ -72,7 +72,7 @@ class ArmCoordination:
 
         Raises:
             OpenArmError: INVALID_ARGUMENT or LIMITS, for what is no trajectory of the arm; IN_COLLISION, when there is
-                no clearance, or no longer because another arm stopped; as `TrajectoryFollower.follow`.
+                no clearance, or no longer because another arm stopped; as `MotionFollower.follow`.
         """
         if not 0.0 <= max_delay < float("inf"):
             raise OpenArmError(Code.INVALID_ARGUMENT, f"max_start_delay is {max_delay:g} s, expected 0 or more")
@@ -125,7 +125,7 @@ class ArmCoordination:
         """Execute trajectories of several arms that begin at the same moment; when one fails the others hold.
 
         Raises:
-            OpenArmError: the first fault; as `TrajectoryFollower.follow`.
+            OpenArmError: the first fault; as `MotionFollower.follow`.
         """
         stamp_ns, state = self._robot.states.latest()
         # both controllers begin at the same moment, so that none begins earlier than the other
@@ -243,7 +243,7 @@ class ArmCoordination:
 class _Halt:
     """Whether an arm under way is to hold: by request, or because another arm stopped in its way."""
 
-    def __init__(self, coordination: ArmCoordination, arm: Arm, cancelled: Callable[[], bool]) -> None:
+    def __init__(self, coordination: DelayCoordination, arm: Arm, cancelled: Callable[[], bool]) -> None:
         self._coordination, self._arm, self._cancelled = coordination, arm, cancelled
         self._known = dict(coordination.stops)
         self.fault: OpenArmError | None = None

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.service.robot import RobotInterface, TrajectoryGoal, Watch
+from openarm_motion.service.robot import RobotInterface, RobotWatch, TrajectoryGoal
 
 if TYPE_CHECKING:
     from openarm_motion.planning.arm import Arm
@@ -44,18 +44,18 @@ class MotionInProgress:
 
 @dataclass(eq=False)
 class _Execution:
-    """One call of `TrajectoryFollower.follow`; `missing` is how long its controller has been missing, s."""
+    """One call of `MotionFollower.follow`; `missing` is how long its controller has been missing, s."""
 
     motion: Motion
     begin_ns: int
     touches: bool
     cancelled: Callable[[], bool]
     progress: Callable[[float], None]
-    watch: Watch
+    watch: RobotWatch
     missing: float = 0.0
 
 
-class TrajectoryFollower:
+class MotionFollower:
     """Executes one motion of one arm at a time.
 
     Args:
@@ -94,7 +94,7 @@ class TrajectoryFollower:
             OpenArmError: NOT_READY, without controller or joint states; ROBOT_LOST, when either vanishes on the way;
                 EXECUTION_FAILED, with the controller's reason or the joint that did not arrive; TIMEOUT; CANCELLED.
         """
-        run = _Execution(motion, begin_ns, touches, cancelled, progress, Watch(self._robot))
+        run = _Execution(motion, begin_ns, touches, cancelled, progress, RobotWatch(self._robot))
         self.begin(motion, begin_ns)
         try:
             await run.watch.fresh()

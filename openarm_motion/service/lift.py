@@ -13,7 +13,7 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.lift import LIFT
 from openarm_common.types import Array
-from openarm_motion.service.robot import RobotInterface, TrajectoryGoal, Watch
+from openarm_motion.service.robot import RobotInterface, RobotWatch, TrajectoryGoal
 
 if TYPE_CHECKING:
     from openarm_motion.planning.lift import LiftedArms
@@ -90,7 +90,7 @@ class LiftMotions:
         controller = self._robot.controller(LIFT)
         if not controller.ready():
             raise OpenArmError(Code.NOT_READY, f"{controller.name} is not there")
-        watch, goal = Watch(self._robot), controller.start(plan, 0, touches=True)
+        watch, goal = RobotWatch(self._robot), controller.start(plan, 0, touches=True)
 
         def check() -> None:
             if watch.silence > self._stale_after:

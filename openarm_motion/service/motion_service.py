@@ -38,7 +38,7 @@ from openarm_motion.scene.map_view import FieldSource, MapState, MapView
 from openarm_motion.scene.planning_scene import PlanningScene
 from openarm_motion.service.claims import ArmClaims
 from openarm_motion.service.context import Around, PlanningContext
-from openarm_motion.service.coordination import ArmCoordination
+from openarm_motion.service.coordination import DelayCoordination
 from openarm_motion.service.faults import PlanFaults
 from openarm_motion.service.lift import LiftMotions
 from openarm_motion.service.requests import (
@@ -60,7 +60,7 @@ from openarm_motion.service.requests import (
     Strategy,
     YieldGoal,
 )
-from openarm_motion.service.robot import RobotInterface, Watch
+from openarm_motion.service.robot import RobotInterface, RobotWatch
 from openarm_motion.timing.trajectory import Motion, Trajectory
 
 #: Called with a stage ("planning", "executing", ...) and its progress: 0 to 1, or the targets that were checked.
@@ -147,7 +147,7 @@ class MotionService:
         self.on_held: Callable[[], None] = lambda: None
         self.scene = PlanningScene(next(iter(arms.values())).static)
         self.memory = HeldObjects()
-        self.coordination = ArmCoordination(robot, arms, self.memory, lambda: self.on_held())
+        self.coordination = DelayCoordination(robot, arms, self.memory, lambda: self.on_held())
         view = MapView(config.map, field, frames)
         self._context = PlanningContext(robot, arms, self.scene, self.memory, self.coordination, view, config)
         self.claims = ArmClaims()
@@ -311,7 +311,7 @@ class MotionService:
         """End all plans and motions; the arms hold where they are, within `limit` s."""
         self.closing = True
         followers = self.coordination.followers.values()
-        await Watch(self.robot).until(lambda: not any(f.active for f in followers), limit=limit)
+        await RobotWatch(self.robot).until(lambda: not any(f.active for f in followers), limit=limit)
 
     @property
     def moving(self) -> list[str]:

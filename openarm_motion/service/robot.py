@@ -29,7 +29,7 @@ _STARVED = 0.1
 
 
 @dataclass(frozen=True)
-class Outcome:
+class GoalOutcome:
     """How a controller ended a trajectory; `text` and `code` are its reason after a failure."""
 
     success: bool
@@ -51,7 +51,7 @@ class TrajectoryGoal(Protocol):
         ...
 
     @property
-    def outcome(self) -> Outcome | None:
+    def outcome(self) -> GoalOutcome | None:
         """How it ended; None before."""
         ...
 
@@ -122,7 +122,7 @@ class RobotInterface(Protocol):
         ...
 
 
-class Watch:
+class RobotWatch:
     """Waits for conditions, and measures how long the robot has been silent while this process was awake.
 
     Messages wait unread while a process is starved, so silence counts only between wakes that are close together.

@@ -16,7 +16,7 @@ import numpy as np
 
 from openarm_common.robot.turns import nearest_turns
 from openarm_common.types import Array
-from openarm_motion.config import ServoConfig
+from openarm_motion.config import ServoingConfig
 from openarm_motion.servo.course import Course, JointState
 from openarm_motion.servo.twist import condition, joint_velocities
 from openarm_motion.timing.trajectory import Motion
@@ -48,7 +48,7 @@ _FORGIVEN = 0.3
 _OTHERS = 5
 
 
-class Status(IntEnum):
+class ServoState(IntEnum):
     """What servoing does with a command; numbers as in moveit_msgs/ServoStatus."""
 
     INVALID = -1
@@ -62,7 +62,7 @@ class Status(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Command:
+class ServoCommand:
     """What is asked: a twist (6,) of the tool in the base frame, or joint velocities (n,); when it came, s."""
 
     velocity: Array
@@ -71,10 +71,10 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Report:
+class ServoReport:
     """What an arm does, and why, in a sentence."""
 
-    status: Status = Status.NO_WARNING
+    status: ServoState = ServoState.NO_WARNING
     text: str = ""
 
 
@@ -87,24 +87,24 @@ class ArmServo:
         follow_tolerance: A joint further than this from its set point does not follow, rad.
     """
 
-    def __init__(self, arm: Arm, config: ServoConfig, follow_tolerance: float) -> None:
+    def __init__(self, arm: Arm, config: ServoingConfig, follow_tolerance: float) -> None:
         self.arm, self._config, self._tolerance = arm, config, follow_tolerance
         self._limits = arm.limits(1.0)
-        self._command: Command | None = None
+        self._command: ServoCommand | None = None
         self._course: Course | None = None
         self._since_ns = 0
         self._set_points: deque[tuple[int, Array]] = deque(maxlen=64)
         self._share = 1.0  # of the speed wanted, that was kept last
         self._hold = _HOLD
         self._fault, self._heard = "", -np.inf
-        self.report = Report()
+        self.report = ServoReport()
 
     @property
     def busy(self) -> bool:
         """Whether the arm is commanded or under way."""
         return self._course is not None or self._command is not None
 
-    def take(self, command: Command) -> None:
+    def take(self, command: ServoCommand) -> None:
         """Follow a command from now on."""
         before = self._command
         if before is None or before.is_twist != command.is_twist or before.velocity @ command.velocity <= 0.0:
@@ -161,7 +161,7 @@ class ArmServo:
             wanted = None
         if wanted is None or not np.any(wanted):
             chosen = Course.of(start, np.zeros_like(start.q), 0.0, self._limits)
-            self._say(Report(Status.INVALID, self._fault) if self._fault else Report())
+            self._say(ServoReport(ServoState.INVALID, self._fault) if self._fault else ServoReport())
         else:
             chosen = self._chosen(start, wanted, around, others, is_twist=is_twist)
         return self._commit(chosen, begin_ns, now_ns, ended=wanted is None)
@@ -220,7 +220,7 @@ class ArmServo:
         self, start: JointState, wanted: Array, around: Surroundings, others: Mapping[str, Array], *, is_twist: bool
     ) -> Course:
         """The course with the greatest share of what is wanted that stops in time."""
-        kinematics, report, velocity, share = self.arm.kinematics, Report(), wanted, 1.0
+        kinematics, report, velocity, share = self.arm.kinematics, ServoReport(), wanted, 1.0
         if is_twist:
             velocity, now = joint_velocities(kinematics, start.q, wanted)
             share, report = self._for_singularity(now, condition(kinematics, start.q + _GLANCE * velocity))
@@ -233,7 +233,7 @@ class ArmServo:
         clear = around.free(here)
         ends = {name: np.unique(rows[[0, -1]], axis=0) for name, rows in others.items()}  # one, where it rests
         near = None if clear else around.near(around.combined(self.arm.name, start.q[None], ends)[:, 0])
-        kept, hit, course = 0.0, Report(), self._course_of(start, velocity, 0.0)[0]
+        kept, hit, course = 0.0, ServoReport(), self._course_of(start, velocity, 0.0)[0]
         tried = min(self._share * _FASTER + _LEAST_SHARE, 1.0 if clear else _ESCAPE)
         for _ in range(_TRIES if clear else _ESCAPES):
             candidate, further = self._course_of(start, velocity, tried)
@@ -244,12 +244,14 @@ class ArmServo:
             hit, tried = refusal, _SLOWER * tried
         self._share = kept
         if kept < _LEAST_SHARE:
-            halts = Status.HALT_FOR_COLLISION if hit.status is Status.DECELERATE_FOR_COLLISION else hit.status
-            self._say(Report(halts, hit.text.replace("slows", "stops", 1)))
+            halts = ServoState.HALT_FOR_COLLISION if hit.status is ServoState.DECELERATE_FOR_COLLISION else hit.status
+            self._say(ServoReport(halts, hit.text.replace("slows", "stops", 1)))
             return self._course_of(start, velocity, 0.0)[0]
         slowed = hit if hit.text else self.report if kept < 1.0 and "slows" in self.report.text else report
         if not clear and not hit.text:
-            slowed = Report(Status.DECELERATE_FOR_COLLISION, f"the {self.arm.name} arm slows: something is too near")
+            slowed = ServoReport(
+                ServoState.DECELERATE_FOR_COLLISION, f"the {self.arm.name} arm slows: something is too near"
+            )
         self._say(slowed)
         return course
 
@@ -266,14 +268,14 @@ class ArmServo:
         around: Surroundings,
         others: Mapping[str, Array],
         near: list[Near] | None,
-    ) -> Report | None:
+    ) -> ServoReport | None:
         """Why a course may not be followed; None: it may. One that begins too `near` may not come nearer.
 
         The latter is checked half way and at its end, by the exact layer, which takes 0.8 ms each.
         """
         name = self.arm.name
         if bound := self._bound(course.start.q, further.end):
-            return Report(Status.JOINT_BOUND, f"the {name} arm slows: {bound}")
+            return ServoReport(ServoState.JOINT_BOUND, f"the {name} arm slows: {bound}")
         for one in (further, course) if near is None else (course,):
             path = one.positions() if near is None else np.stack([one.at(0.5 * one.duration).q, one.end])
             ways = around.combined(name, path, others)
@@ -282,7 +284,9 @@ class ArmServo:
             else:
                 keeps_clear = all(around.no_nearer(way, was) for way, was in zip(ways, near, strict=True))
             if not keeps_clear:
-                return Report(Status.DECELERATE_FOR_COLLISION, f"the {name} arm slows: {self._what(ways[0], around)}")
+                return ServoReport(
+                    ServoState.DECELERATE_FOR_COLLISION, f"the {name} arm slows: {self._what(ways[0], around)}"
+                )
         return None
 
     def _what(self, way: Array, around: Surroundings) -> str:
@@ -304,18 +308,18 @@ class ArmServo:
         limits = f"{self.arm.lower[j]:.3f} to {self.arm.upper[j]:.3f}"
         return f"{self.arm.names[j]} at {before[j]:.3f} rad is near its limits {limits}"
 
-    def _for_singularity(self, now: float, soon: float) -> tuple[float, Report]:
+    def _for_singularity(self, now: float, soon: float) -> tuple[float, ServoReport]:
         """Share of the speed near a singular posture, by the condition number now and a moment later."""
         low, high = self._config.lower_singularity_threshold, self._config.hard_stop_singularity_threshold
         if now <= low:
-            return 1.0, Report()
+            return 1.0, ServoReport()
         share = max(0.0, (high - now) / (high - low)) if np.isfinite(now) else 0.0
         bounds = f"slow above {low:g}, stop at {high:g}"
         text = f"the {self.arm.name} arm is near a singular posture: condition {now:.0f}; {bounds}"
         if soon <= now:
-            return max(share, _LEAVING), Report(Status.DECELERATE_FOR_LEAVING_SINGULARITY, text)
-        status = Status.DECELERATE_FOR_APPROACHING_SINGULARITY if share > 0.0 else Status.HALT_FOR_SINGULARITY
-        return share, Report(status, text)
+            return max(share, _LEAVING), ServoReport(ServoState.DECELERATE_FOR_LEAVING_SINGULARITY, text)
+        status = ServoState.DECELERATE_FOR_APPROACHING_SINGULARITY if share > 0.0 else ServoState.HALT_FOR_SINGULARITY
+        return share, ServoReport(status, text)
 
-    def _say(self, report: Report) -> None:
+    def _say(self, report: ServoReport) -> None:
         self.report = report

@@ -11,8 +11,8 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.config import ServoConfig
-from openarm_motion.servo.arm_servo import ArmServo, Command, Report, Status
+from openarm_motion.config import ServoingConfig
+from openarm_motion.servo.arm_servo import ArmServo, ServoCommand, ServoReport, ServoState
 from openarm_motion.servo.surroundings import Surroundings
 from openarm_motion.timing.trajectory import Motion
 
@@ -29,7 +29,7 @@ _OWNED = "is moved by servoing; wait until the commands cease, or call stop_serv
 _SAMPLES, _AHEAD = 8, 1.0
 
 
-class Servo:
+class Servoing:
     """Servoing. `start`, `stop` and `refresh` come from the event loop, all else from one thread that keeps the pace.
 
     Args:
@@ -38,7 +38,9 @@ class Servo:
         send: Hands a trajectory of an arm, and the stamp of its beginning, to its controller.
     """
 
-    def __init__(self, service: MotionService, config: ServoConfig, send: Callable[[str, Motion, int], None]) -> None:
+    def __init__(
+        self, service: MotionService, config: ServoingConfig, send: Callable[[str, Motion, int], None]
+    ) -> None:
         self._service, self._config, self._send = service, config, send
         self._lock = threading.Lock()
         self._around: Surroundings | None = None
@@ -64,7 +66,7 @@ class Servo:
         """The arms that take commands."""
         return frozenset(self._started)
 
-    def reports(self) -> Mapping[str, Report]:
+    def reports(self) -> Mapping[str, ServoReport]:
         """What each arm does."""
         return {name: arm.report for name, arm in self._arms.items()}
 
@@ -126,7 +128,7 @@ class Servo:
             raise OpenArmError(Code.NOT_READY, f"no /joint_states of the {name} arm yet; is its driver running?")
         turn = self._service.in_base(np.eye(4), frame, self._state)[:3, :3]
         base = np.concatenate([turn @ velocity[:3], turn @ velocity[3:]])
-        self._take(name, Command(base, at, is_twist=True))
+        self._take(name, ServoCommand(base, at, is_twist=True))
 
     def jog(self, names: Sequence[str], velocities: Sequence[float], at: float) -> None:
         """Move joints of one arm with velocities.
@@ -147,7 +149,7 @@ class Servo:
         given = self._checked(np.array(velocities, dtype=np.float64), names, "velocity of")
         velocity = np.zeros(len(joints))
         velocity[[joints.index(joint) for joint in names]] = given * self._units(self._config.scale.joint)
-        self._take(name, Command(velocity, at, is_twist=False))
+        self._take(name, ServoCommand(velocity, at, is_twist=False))
 
     def arm_of(self, joints: Sequence[str]) -> str:
         """The arm that joints belong to.
@@ -185,7 +187,7 @@ class Servo:
             raise OpenArmError(Code.INVALID_ARGUMENT, text)
         return values
 
-    def _take(self, name: str, command: Command) -> None:
+    def _take(self, name: str, command: ServoCommand) -> None:
         if name not in self._started:
             raise OpenArmError(Code.NOT_READY, f"servoing of the {name} arm is not started; call start_servo")
         if self._around is None:
@@ -228,7 +230,7 @@ class Servo:
             self._started.clear()
             for name in sorted(self._claimed):
                 self._arms[name].drop()
-                self._arms[name].report = Report(Status.INVALID, f"the {name} arm stops: {why}")
+                self._arms[name].report = ServoReport(ServoState.INVALID, f"the {name} arm stops: {why}")
                 self._service.claims.give(name)
             self._claimed.clear()
 
@@ -266,7 +268,7 @@ class Servo:
         else:
             arm.drop()  # the last trajectory ends at rest
         if why:
-            arm.report = Report(Status.INVALID, f"the {name} arm stops: {why}")
+            arm.report = ServoReport(ServoState.INVALID, f"the {name} arm stops: {why}")
         if not arm.busy:
             self._service.claims.give(name)
             self._claimed.discard(name)

@@ -13,7 +13,7 @@ from visualization_msgs.msg import MarkerArray
 
 from openarm_common.octree.blocks import CellSet
 from openarm_common.ros.node import QOS_LATCHED
-from openarm_octomap.mapper import Snapshot
+from openarm_octomap.mapper import MapSnapshot
 from openarm_octomap.ros import convert
 
 
@@ -43,7 +43,7 @@ class MapPublisher:
         wanted = {"states"} if listening or self._changes.get_subscription_count() else set[str]()
         return wanted | ({"full"} if self._full_wanted else set())
 
-    def publish(self, snapshot: Snapshot, t_ns: int, changed: CellSet | None = None) -> None:
+    def publish(self, snapshot: MapSnapshot, t_ns: int, changed: CellSet | None = None) -> None:
         """Publish a snapshot; without `changed` it is a new map, which all topics show at once.
 
         Args:

@@ -20,11 +20,11 @@ from openarm_common.ros.lifecycle_node import ManagedNode
 from openarm_common.ros.node import run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_octomap.config import OctomapNodeConfig
-from openarm_octomap.mapper import Frame, Mapper, Report
+from openarm_octomap.mapper import Frame, Mapper, MapReport
 from openarm_octomap.ros.map_publisher import MapPublisher
 from openarm_octomap.ros.map_server import MapServices
 from openarm_octomap.ros.map_topic import MapTopic
-from openarm_octomap.ros.sources import Source, cloud_source, depth_source
+from openarm_octomap.ros.sources import MapSource, cloud_source, depth_source
 
 
 class OctomapNode(ManagedNode[OctomapNodeConfig]):
@@ -49,14 +49,14 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         # Twice in a period: the newest is then at most half a period old.
         taken = [topic.format(camera=name) for topic in topics.values() for name in config.cameras]
         self.take_images_at(2.0 / config.period, taken)
-        self._sources: list[Source] = [*self._cameras]
+        self._sources: list[MapSource] = [*self._cameras]
         if config.cloud_topic:
             self._sources.append(cloud_source(self, self._states, config.cloud_topic, need))
         self._t_ns = 0
         self._busy = False
         self._updates = self._overruns = 0
         self._elapsed_ms = 0.0
-        self._last: Report | None = None
+        self._last: MapReport | None = None
         self._fault = ""
         self._field = self._open_field() if config.field.enabled else None
         self._publisher = MapPublisher(self, self.description.base, full=config.publish_full)
@@ -115,7 +115,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
             return
         self._busy = True
         try:
-            report: Report = await self.in_thread(
+            report: MapReport = await self.in_thread(
                 self._update, frames, self._states.tracker.held, self._publisher.wanted(), edition
             )
         except OpenArmError as error:
@@ -131,7 +131,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         else:  # the map was reset, loaded or edited meanwhile: what was computed is out of date
             self._show()
 
-    def _update(self, frames: list[Frame], held: tuple[HeldBox, ...], wanted: set[str], edition: int) -> Report:
+    def _update(self, frames: list[Frame], held: tuple[HeldBox, ...], wanted: set[str], edition: int) -> MapReport:
         """Do one update, in a worker thread."""
         begin = time.thread_time()
         slot = self._field.begin() if self._field is not None else None

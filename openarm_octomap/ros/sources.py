@@ -25,7 +25,7 @@ from openarm_octomap.mapper import Frame as MapFrame
 Scan = DepthScan | CloudScan
 
 
-class Source:
+class MapSource:
     """A stream of frames and what became of them.
 
     Args:
@@ -106,7 +106,7 @@ class Source:
 
 def depth_source(
     node: BaseNode[Any], states: RobotStateListener, camera: CameraConfig, topics: Mapping[str, str], joints: JointNeed
-) -> Source:
+) -> MapSource:
     """Return the source of the depth images of a camera, in its optical frame.
 
     Args:
@@ -124,10 +124,10 @@ def depth_source(
         return DepthScan(depth, lens.intrinsics, frame.posture.T_base_frame, camera.near, camera.far)
 
     inputs = camera_topics(camera.name, **topics)
-    return Source(camera.name, CameraStream(node, states, inputs, camera.optical_frame, joints=joints), to_scan)
+    return MapSource(camera.name, CameraStream(node, states, inputs, camera.optical_frame, joints=joints), to_scan)
 
 
-def cloud_source(node: BaseNode[Any], states: RobotStateListener, topic: str, joints: JointNeed) -> Source:
+def cloud_source(node: BaseNode[Any], states: RobotStateListener, topic: str, joints: JointNeed) -> MapSource:
     """Return the source of clouds in any known frame, whose origin is taken for that of the rays.
 
     Args:
@@ -144,4 +144,4 @@ def cloud_source(node: BaseNode[Any], states: RobotStateListener, topic: str, jo
         in_base = finite @ T_base_frame[:3, :3].T + T_base_frame[:3, 3]
         return CloudScan(in_base.astype(np.float32), T_base_frame[:3, 3])
 
-    return Source(topic, CameraStream(node, states, {"cloud": (PointCloud2, topic)}, joints=joints), to_scan)
+    return MapSource(topic, CameraStream(node, states, {"cloud": (PointCloud2, topic)}, joints=joints), to_scan)

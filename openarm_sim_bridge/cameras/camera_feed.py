@@ -69,7 +69,7 @@ class SpareProcess:
         os.kill(self.pid, signal.SIGKILL)
 
 
-class CameraFeed:
+class RenderedFeed:
     """Keeps a drawing process and feeds it.
 
     It ends when the bridge closes its end of the socket, however the bridge ended. A process that reports that it can't

@@ -72,7 +72,7 @@ class CameraReport:
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
+class _RenderState:
     t_ns: int
     qpos: Array
     names: frozenset[str]
@@ -103,7 +103,7 @@ class StateSender:
             if self._model is not snapshot.model:
                 self._send_model(snapshot.model)
                 self._model = snapshot.model
-            self._send(_State(snapshot.t_ns, snapshot.qpos, frozenset(names)))
+            self._send(_RenderState(snapshot.t_ns, snapshot.qpos, frozenset(names)))
         except (BlockingIOError, ConnectionError):
             return False
         return True
@@ -148,7 +148,7 @@ class StateSender:
 
 
 @dataclass(frozen=True)
-class Work:
+class RenderWork:
     """A state to draw, and for which cameras."""
 
     snapshot: Snapshot
@@ -176,14 +176,14 @@ class StateReceiver:
         self.setup: CameraSetup = pickle.loads(body)
         self._end.setblocking(False)
 
-    def take(self, timeout_s: float) -> Work | None:
+    def take(self, timeout_s: float) -> RenderWork | None:
         """Wait for states; return the newest one for all cameras that any of them was for, None when none came.
 
         Raises:
             EOFError: The bridge has ended.
         """
         select.select([self._end], [], [], timeout_s)
-        work: Work | None = None
+        work: RenderWork | None = None
         for message, files in _received(self._end):
             if files:
                 self._model = _load_model(files)
@@ -192,7 +192,7 @@ class StateReceiver:
             elif self._model is not None:
                 names = work.names if work is not None else frozenset[str]()
                 self.dropped += len(names)
-                work = Work(Snapshot(self._model, message.t_ns, message.qpos), names | message.names)
+                work = RenderWork(Snapshot(self._model, message.t_ns, message.qpos), names | message.names)
         return work
 
     def report(self, report: CameraReport) -> None:

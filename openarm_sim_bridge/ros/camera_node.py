@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.cameras.handover import CameraReport, StateReceiver, Work
+from openarm_sim_bridge.cameras.handover import CameraReport, RenderWork, StateReceiver
 from openarm_sim_bridge.ros.camera_publisher import CameraPublisher
 
 NODE_NAME = "mujoco_cameras"
@@ -65,7 +65,7 @@ class CameraNode(Node):
             if time.monotonic() >= self._report_at:
                 self._report()
 
-    def _attempt(self, work: Work) -> None:
+    def _attempt(self, work: RenderWork) -> None:
         try:
             self._draw(work)
         except OpenArmError as error:
@@ -75,7 +75,7 @@ class CameraNode(Node):
         if self._fault:
             self._report()
 
-    def _draw(self, work: Work) -> None:
+    def _draw(self, work: RenderWork) -> None:
         images = self._images
         if not self._ready:  # the first frame of a camera takes long
             images.cameras.load(work.snapshot)

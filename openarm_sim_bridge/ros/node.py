@@ -3,7 +3,7 @@
 
 Threads: physics (steps the world at 100 Hz, publishes its state) and the executor (services, actions, commands). They
 share data only through `Simulation.call`. The cameras are drawn and published by a process of their own, the node
-`mujoco_cameras`, which receives the states to draw (`CameraFeed`).
+`mujoco_cameras`, which receives the states to draw (`RenderedFeed`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from openarm_common.ros.node import reliable, run, until_shutdown
 from openarm_common.scene.scene import load_scene
 from openarm_control.joints import JointReadout
 from openarm_control.ros.process import ControlNode, timely
-from openarm_sim_bridge.cameras.camera_feed import CameraFeed, SpareProcess
+from openarm_sim_bridge.cameras.camera_feed import RenderedFeed, SpareProcess
 from openarm_sim_bridge.cameras.handover import CameraSetup
 from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.faults.faults import Fault
@@ -140,7 +140,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
 
     def _camera_feed(
         self, cameras: Mapping[str, CameraConfig], first: Snapshot, spare: SpareProcess | None
-    ) -> CameraFeed:
+    ) -> RenderedFeed:
         topics = [name for camera in cameras.values() for name in topic_names(camera)]
         setup = CameraSetup(
             cameras=tuple(cameras.values()),
@@ -153,7 +153,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         environ = {**os.environ, "ROS_DOMAIN_ID": str(self.context.get_domain_id())}
         if LARGE_PROFILE in environ:
             environ[PROFILE] = environ[LARGE_PROFILE]
-        return CameraFeed(setup, environ, first, self._on_no_images, self.config.speed, spare)
+        return RenderedFeed(setup, environ, first, self._on_no_images, self.config.speed, spare)
 
     def _on_no_images(self, fault: str) -> None:
         if fault:

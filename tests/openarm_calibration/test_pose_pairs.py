@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_calibration.foreign.conventions import FORMS, Convention, checked_form, readings
-from openarm_calibration.foreign.explain import BOARD_FRAMES, ROBOT_FRAMES, Poses, Tried, decided, search
+from openarm_calibration.foreign.explain import BOARD_FRAMES, ROBOT_FRAMES, Hypothesis, Poses, decided, search
 from openarm_calibration.handeye.consensus import agreed
 from openarm_calibration.handeye.pose_pairs import PosePairs, solve_pairs
 from openarm_calibration.handeye.refine import mount_error
@@ -147,7 +147,7 @@ def test_an_arm_of_four_axes_tells_five_numbers_of_the_mount_and_takes_the_sixth
         solve_pairs(files.truth(setup).pairs, {"z": 0.1})
 
 
-def told(known: files.Truth, robot: str = "xyzw", board: str = "matrix", **stated) -> Tried:
+def told(known: files.Truth, robot: str = "xyzw", board: str = "matrix", **stated) -> Hypothesis:
     """The convention that is found of poses in these forms, mm where `unit` or `board_unit` says so."""
     usual = {"unit": "m", "board_unit": "m", "setup": known.setup, "inverse": False, "board_inverse": False}
     ways = {key: stated.pop(key, value) for key, value in usual.items()}

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import hand_eye_problems as synthetic
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
-from openarm_calibration.handeye.problem import View, assemble
+from openarm_calibration.handeye.problem import BoardView, assemble
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.transforms import difference, moved
@@ -90,7 +90,8 @@ def test_scale_and_intrinsics_come_out_right() -> None:
     """A board printed 1 % small is found by its scale; a wrong focal length by freed intrinsics."""
     truth = synthetic.trial("in_hand", 15, Noise(0.1), np.random.default_rng(5))
     small = [
-        View(v.points * 0.99, v.pixels, v.A, v.setup, radius=v.radius * 0.99, pose=v.pose) for v in truth.problem.views
+        BoardView(v.points * 0.99, v.pixels, v.A, v.setup, radius=v.radius * 0.99, pose=v.pose)
+        for v in truth.problem.views
     ]
     scaled = assemble(small, [synthetic.INTRINSICS], list(truth.problem.free))
     estimate = solve(scaled, SolveConfig(extras=("scale",))).estimate
@@ -123,7 +124,7 @@ def test_marks_in_a_wrong_order_are_an_outlier_too() -> None:
     truth = synthetic.trial("in_hand", 12, Noise(0.1), np.random.default_rng(7))
     views = list(truth.problem.views)
     right = views[4]
-    views[4] = View(right.points, right.pixels[::-1].copy(), right.A, "in_hand", right.radius, pose=4, name="s04")
+    views[4] = BoardView(right.points, right.pixels[::-1].copy(), right.A, "in_hand", right.radius, pose=4, name="s04")
     solution = solve(assemble(views, [synthetic.INTRINSICS], list(truth.problem.free)))
     assert [outlier.name for outlier in solution.outliers] == ["s04"]
     assert "do not lie on the board" in solution.outliers[0].reason
@@ -188,14 +189,14 @@ def test_both_set_ups_in_one_solve_share_the_robots_error_and_a_board() -> None:
     views = list(wrist.problem.views)
     guesses = list(wrist.problem.free)
     for view, free in zip(overhead.problem.views, overhead.problem.free, strict=True):
-        views.append(View(view.points, view.pixels, view.A, "to_hand", view.radius, 1, 1, 100 + view.pose))
+        views.append(BoardView(view.points, view.pixels, view.A, "to_hand", view.radius, 1, 1, 100 + view.pose))
         guesses.append(free)
     T = se3.inverse(overhead.X) @ wrist.Z  # the table's board from above
     from openarm_calibration.handeye.problem import project
 
     pixels = project(synthetic.BOARD.points, synthetic.BOARD.radius, T, np.array([900.0, 900.0, 640.0, 360.0]))
     pixels = pixels + rng.normal(0.0, noise.px, pixels.shape)
-    views.append(View(synthetic.BOARD.points, pixels, np.eye(4), "fixed", synthetic.BOARD.radius, 1, 0, 999))
+    views.append(BoardView(synthetic.BOARD.points, pixels, np.eye(4), "fixed", synthetic.BOARD.radius, 1, 0, 999))
     guesses.append(T)
     both = solve(assemble(views, [synthetic.INTRINSICS] * 2, guesses))
     alone = solve(overhead.problem)

@@ -17,7 +17,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.types import Array
-from openarm_motion.config import LimitsConfig
+from openarm_motion.config import MotionLimits
 from openarm_motion.timing.trajectory import time_polyline
 from tests.refusals import refuses
 
@@ -123,7 +123,7 @@ def test_ten_hertz_serve_an_arm_at_rest_and_not_one_that_accelerates(measured: b
 @pytest.mark.parametrize("measured", [True, False])
 @pytest.mark.requirement("A-72")
 def test_a_hundred_hertz_serve_the_fastest_motions_of_the_planner(measured: bool) -> None:
-    limits, rng = LimitsConfig().of(ROBOT.motion, "right", ARM), np.random.default_rng(0)
+    limits, rng = MotionLimits().of(ROBOT.motion, "right", ARM), np.random.default_rng(0)
     refused = 0
     for _ in range(5):
         path = time_polyline(ARM, rng.uniform(LOW, HIGH, (2, 7)), limits)

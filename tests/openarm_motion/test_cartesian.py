@@ -12,7 +12,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.solids import box_from
-from openarm_motion.kinematics.chain import ArmKinematics, Solution
+from openarm_motion.kinematics.chain import ArmKinematics, IkSolution
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.kinematics.line import line_contact, line_poses, solve_line
 from openarm_motion.planning.arm import Arm
@@ -23,7 +23,7 @@ def down(x: float, y: float, z: float) -> np.ndarray:
     return se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (x, y, z))
 
 
-def at_home(arm: Arm, home: dict[str, float]) -> tuple[Solution, np.ndarray]:
+def at_home(arm: Arm, home: dict[str, float]) -> tuple[IkSolution, np.ndarray]:
     """Where a line begins: the solution and its pose."""
     start = arm.inverse.classify([home[name] for name in arm.names])
     return start, arm.kinematics.fk(start.q)

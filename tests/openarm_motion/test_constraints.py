@@ -19,7 +19,7 @@ from openarm_motion.constraints.goals import in_region
 from openarm_motion.constraints.names import RobotNames
 from openarm_motion.constraints.plans import to_region
 from openarm_motion.constraints.queries import at_pose, judge
-from openarm_motion.constraints.regions import JointInterval, OrientationRegion, PositionRegion, Region, Volume
+from openarm_motion.constraints.regions import JointInterval, OrientationRegion, PositionRegion, TaskRegion, Volume
 from openarm_motion.planning.moves import RequestBoxes
 from tests.refusals import refused, refuses
 
@@ -64,8 +64,8 @@ def test_an_interval_without_sense_is_refused_by_name() -> None:
 
 
 def test_a_goal_of_joints_of_another_arm_is_refused(arm, now) -> None:
-    region = Region((JointInterval("openarm_left_joint1", 0.0, 0.1, 0.1),))
-    goal = Region((JointInterval(arm.names[0], 0.0, 2.0, 2.0),))
+    region = TaskRegion((JointInterval("openarm_left_joint1", 0.0, 0.1, 0.1),))
+    goal = TaskRegion((JointInterval(arm.names[0], 0.0, 2.0, 2.0),))
     for ask in (
         lambda: to_region(arm, now, RegionGoal((region,)), NOTHING),
         lambda: to_region(arm, now, RegionGoal((goal,), region), NOTHING),
@@ -85,7 +85,7 @@ def test_the_end_of_a_plan_lies_in_the_region_and_the_nearer_of_two_is_taken(T: 
     near, far = T.copy(), T.copy()
     near[:3, 3] += (0.0, 0.02, 0.02)
     far[:3, 3] += (0.02, 0.1, 0.1)
-    goal = RegionGoal((at_pose(near, Region()), at_pose(far, Region())))
+    goal = RegionGoal((at_pose(near, TaskRegion()), at_pose(far, TaskRegion())))
 
     trajectory = to_region(arm, now, goal, NOTHING)
 
@@ -94,7 +94,9 @@ def test_the_end_of_a_plan_lies_in_the_region_and_the_nearer_of_two_is_taken(T: 
 
 def test_a_position_alone_is_reached_in_whatever_orientation(T: np.ndarray, arm, now) -> None:
     p = T[:3, 3] + (0.0, 0.05, 0.05)
-    region = Region(positions=(PositionRegion("tool", np.zeros(3), (Volume("sphere", se3.make(None, p), (1e-3,)),)),))
+    region = TaskRegion(
+        positions=(PositionRegion("tool", np.zeros(3), (Volume("sphere", se3.make(None, p), (1e-3,)),)),)
+    )
 
     trajectory = to_region(arm, now, RegionGoal((region,)), NOTHING)
 
@@ -105,16 +107,16 @@ def test_poses_are_drawn_until_the_time_is_over_and_of_one_pose_there_is_nothing
     far = arm.kinematics.fk(now.start)
     far[0, 3] += 3.0
     place = PositionRegion("the tool", np.zeros(3), (Volume("sphere", far, (0.5,)),))
-    wide = Region(positions=(place,), orientations=at_pose(far, Region()).orientations)
+    wide = TaskRegion(positions=(place,), orientations=at_pose(far, TaskRegion()).orientations)
     tried: list[float] = []
     monkeypatch.setattr(arm.inverse, "solutions", lambda *about: tried.append(0.0) or [])
 
-    def count(region: Region, end: float) -> int:
+    def count(region: TaskRegion, end: float) -> int:
         tried.clear()
         refused("can't reach the goal", in_region, arm, region, now.start, end=end)
         return len(tried)
 
-    once = count(at_pose(far, Region()), np.inf)
+    once = count(at_pose(far, TaskRegion()), np.inf)
     assert count(wide, np.inf) > 40 * once
     assert count(wide, -np.inf) == once
 
@@ -122,9 +124,9 @@ def test_poses_are_drawn_until_the_time_is_over_and_of_one_pose_there_is_nothing
 def test_a_path_stays_in_its_region(T: np.ndarray, arm, now) -> None:
     there = T.copy()
     there[:3, 3] += (0.02, 0.06, 0.06)
-    path = Region(orientations=(OrientationRegion("tool", np.eye(3), T[:3, :3], (0.05, 0.05, 3.2)),))
+    path = TaskRegion(orientations=(OrientationRegion("tool", np.eye(3), T[:3, :3], (0.05, 0.05, 3.2)),))
 
-    trajectory = to_region(arm, now, RegionGoal((at_pose(there, Region()),), path), NOTHING)
+    trajectory = to_region(arm, now, RegionGoal((at_pose(there, TaskRegion()),), path), NOTHING)
 
     states = trajectory.at(np.linspace(0.0, trajectory.duration, 300))[0]
     assert not path.violations(arm.names, states, arm.kinematics.fk_many(states)).any()
@@ -132,9 +134,9 @@ def test_a_path_stays_in_its_region(T: np.ndarray, arm, now) -> None:
 
 def test_a_goal_outside_of_the_path_region_is_named(T: np.ndarray, arm, now) -> None:
     there = T @ se3.make(se3.rot_x(0.4))
-    path = Region(orientations=(OrientationRegion("tool", np.eye(3), T[:3, :3], (0.05, 0.05, 0.05)),))
+    path = TaskRegion(orientations=(OrientationRegion("tool", np.eye(3), T[:3, :3], (0.05, 0.05, 0.05)),))
     with refuses(Code.VIOLATION, "the goal violates the path constraints"):
-        to_region(arm, now, RegionGoal((at_pose(there, Region()),), path), NOTHING)
+        to_region(arm, now, RegionGoal((at_pose(there, TaskRegion()),), path), NOTHING)
 
 
 @pytest.mark.requirement("B-47")
@@ -172,10 +174,12 @@ def test_a_motion_that_would_take_days_is_refused(T: np.ndarray, arm, now, scale
 
 
 def test_a_state_is_judged_by_contacts_and_constraints(T: np.ndarray, arm, now) -> None:
-    other = Region(orientations=(OrientationRegion("tool", np.eye(3), T[:3, :3] @ se3.rot_x(0.5), (0.1, 0.1, 0.1)),))
+    other = TaskRegion(
+        orientations=(OrientationRegion("tool", np.eye(3), T[:3, :3] @ se3.rot_x(0.5), (0.1, 0.1, 0.1)),)
+    )
     box = box_from("box", T[:3, 3], (0.1, 0.1, 0.1))
 
-    assert judge(arm, now, NOTHING, Region()).valid
+    assert judge(arm, now, NOTHING, TaskRegion()).valid
     blocked = judge(arm, now, RequestBoxes((box,)), other)
 
     assert not blocked.valid
@@ -187,7 +191,7 @@ def test_the_distance_from_a_constraint_counts_by_its_weight(T: np.ndarray, arm,
     turned = OrientationRegion("tool", np.eye(3), T[:3, :3] @ se3.rot_x(0.5), (0.1, 0.1, 0.1), weight=2.5)
     joint = JointInterval(arm.names[0], float(now.start[0]) + 0.3, 0.1, 0.1, weight=0.5)
 
-    verdict = judge(arm, now, NOTHING, Region((joint,), (), (turned,)))
+    verdict = judge(arm, now, NOTHING, TaskRegion((joint,), (), (turned,)))
 
     assert [beyond for _, beyond in verdict.constraints] == pytest.approx([0.5 * 0.2, 2.5 * 0.4], abs=1e-6)
 
@@ -196,7 +200,7 @@ def test_more_attempts_take_the_path_that_is_followed_soonest(arm, now) -> None:
     """Of ways about a box; a straight line needs no second one."""
     q = now.start + np.array([0.9, 0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
     box = box_from("box", arm.kinematics.fk(0.5 * (now.start + q))[:3, 3], (0.1, 0.1, 0.1))
-    goal = RegionGoal((Region(tuple(JointInterval(n, x, 1e-3, 1e-3) for n, x in zip(arm.names, q, strict=True))),))
+    goal = RegionGoal((TaskRegion(tuple(JointInterval(n, x, 1e-3, 1e-3) for n, x in zip(arm.names, q, strict=True))),))
 
     def seconds(seeds: range, *boxes: Box) -> float:
         return to_region(arm, replace(now, seeds=seeds), goal, RequestBoxes(boxes)).duration

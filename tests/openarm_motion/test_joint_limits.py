@@ -15,7 +15,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
-from openarm_motion.config import LimitsConfig, MotionConfig
+from openarm_motion.config import MotionConfig, MotionLimits
 from openarm_motion.kinematics.chain import ArmKinematics, IkResult
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.kinematics.srs import SrsArm
@@ -159,7 +159,7 @@ def test_what_is_away_never_reads_as_nothing(position: float, rotation: float, f
 
 @pytest.fixture(scope="module")
 def planned(arms: dict[str, Arm], six: RobotDescription) -> dict[str, Arm]:
-    limits = LimitsConfig(velocity=(1.0,) * 6, acceleration=(3.0,) * 6, jerk=(30.0,) * 6)
+    limits = MotionLimits(velocity=(1.0,) * 6, acceleration=(3.0,) * 6, jerk=(30.0,) * 6)
     config = MotionConfig(arms=("six",), tool_link="tool", group="{arm}", limits=limits, scene="")
     return {**arms, "six": Arm("six", six, config)}
 

@@ -11,7 +11,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import LEAST_SCALE
 from openarm_motion.collision.solids import Box
-from openarm_motion.config import LimitsConfig, MotionConfig
+from openarm_motion.config import MotionConfig, MotionLimits
 from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.moves import RequestBoxes
@@ -124,7 +124,7 @@ def test_velocity_scale_stretches_time(right: Arm, home: dict[str, float]) -> No
 
 @pytest.mark.requirement("B-13")
 def test_another_arm_is_a_matter_of_configuration(six: RobotDescription) -> None:
-    limits = LimitsConfig(velocity=(1.0,) * 6, acceleration=(3.0,) * 6, jerk=(30.0,) * 6)
+    limits = MotionLimits(velocity=(1.0,) * 6, acceleration=(3.0,) * 6, jerk=(30.0,) * 6)
     config = MotionConfig(arms=("main",), tool_link="tool", group="{arm}", limits=limits, scene="")
     arm = Arm("main", six, config)
     now = arm.start_state(dict.fromkeys(arm.names, 0.1))

@@ -12,7 +12,7 @@ from benchmarks.robot_models import ROBOTS, TrueMeshes, load_arm, states_of
 from benchmarks.robot_problems import FAMILIES, problems
 from openarm_common import se3
 from openarm_motion.collision.solids import box_from
-from openarm_motion.config import LimitsConfig, MotionConfig
+from openarm_motion.config import MotionConfig, MotionLimits
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.moves import RequestBoxes, to_pose, to_pose_on_line
 from openarm_motion.planning.rrt import FastPlanner
@@ -76,6 +76,6 @@ def test_plans_keep_the_speeds_of_the_description_where_the_folder_rounds_them_u
     """1.4 rad/s of a folder, 1.3963 of its URDF: the controllers, which read the URDF, refuse more. 0: not known."""
     names = description.arm_joints("right")
     slower = [replace(description.joint(names[0]), velocity=1.3963), replace(description.joint(names[1]), velocity=0.0)]
-    limits = LimitsConfig(velocity=(1.4,) * 7, acceleration=(6.0,) * 7, jerk=(60.0,) * 7)
+    limits = MotionLimits(velocity=(1.4,) * 7, acceleration=(6.0,) * 7, jerk=(60.0,) * 7)
     arm = Arm("right", description._with_joints(*slower), MotionConfig(limits=limits))
     np.testing.assert_array_equal(arm.limits(1.0).velocity, [1.3963, *(1.4,) * 6])

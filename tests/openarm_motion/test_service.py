@@ -35,7 +35,7 @@ from openarm_motion.service.requests import (
     PlanApproachRequest,
     PoseGoal,
 )
-from openarm_motion.service.robot import Outcome
+from openarm_motion.service.robot import GoalOutcome
 from openarm_motion.timing.trajectory import Motion
 
 TICK_NS = 10_000_000
@@ -44,7 +44,7 @@ TICK_NS = 10_000_000
 class Goal:
     def __init__(self, robot: Robot, motion: Motion, begin_ns: int) -> None:
         self.robot, self.motion, self.begin_ns = robot, motion, begin_ns
-        self.outcome: Outcome | None = None
+        self.outcome: GoalOutcome | None = None
 
     @property
     def accepted(self) -> bool | None:
@@ -55,7 +55,7 @@ class Goal:
         return self.begin_ns if self.robot.tells and self.robot.t_ns > self.begin_ns + 3 * TICK_NS else 0
 
     def cancel(self) -> None:
-        self.outcome = self.outcome or Outcome(False, "cancelled")
+        self.outcome = self.outcome or GoalOutcome(False, "cancelled")
 
 
 class Controller:
@@ -84,7 +84,7 @@ class Controller:
             moved = goal.motion.joints_at(max(elapsed, 0.0))
             self.robot.state.update({name: x for name, x in moved.items() if name not in self.robot.stuck})
             if elapsed >= goal.motion.duration:
-                goal.outcome = Outcome(True)
+                goal.outcome = GoalOutcome(True)
 
 
 class Robot:
@@ -298,7 +298,7 @@ def test_a_cancelled_motion_holds(bench) -> None:
     (answer,) = bench.run(bench.service.move(MoveRequest("right", NamedGoal("official_home"), scale=0.1), stopped))
     assert answer.code is Code.CANCELLED
     assert "the right arm holds where it is" in answer.message
-    assert bench.robot.controllers["right"].goals[0].outcome == Outcome(False, "cancelled")
+    assert bench.robot.controllers["right"].goals[0].outcome == GoalOutcome(False, "cancelled")
     assert bench.service.moving == []
 
 

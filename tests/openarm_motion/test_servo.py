@@ -9,9 +9,9 @@ import pytest
 from openarm_motion.collision.exact import Clearance
 from openarm_motion.collision.occupancy import Environment
 from openarm_motion.collision.solids import box_from
-from openarm_motion.config import ServoConfig
+from openarm_motion.config import ServoingConfig
 from openarm_motion.planning.moves import named_posture
-from openarm_motion.servo.arm_servo import ArmServo, Command, Status
+from openarm_motion.servo.arm_servo import ArmServo, ServoCommand, ServoState
 from openarm_motion.servo.course import Course, JointState
 from openarm_motion.servo.surroundings import Surroundings
 from openarm_motion.servo.twist import joint_velocities
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.requirement("R-29")
 
 TICK_NS = 10_000_000
 TOUCH = Clearance(own=0.0, world=0.0, arms=0.0, hand=0.0, touch=0.0, rest=0.0)
-CONFIG = ServoConfig()
+CONFIG = ServoingConfig()
 
 
 class Bench:
@@ -49,7 +49,7 @@ class Bench:
         for name, servo in self.servos.items():
             if name in commands:
                 velocity = np.asarray(commands[name], dtype=float)
-                servo.take(Command(velocity, self.t_ns * 1e-9, is_twist=len(velocity) == 6))
+                servo.take(ServoCommand(velocity, self.t_ns * 1e-9, is_twist=len(velocity) == 6))
             others = {
                 other: np.vstack([self.q[other], self.servos[other].ahead(self.t_ns)])
                 for other in self.servos
@@ -111,7 +111,7 @@ def test_a_twist_moves_the_tool_as_it_says(bench):
     moved = bench.tool("right") - before
     assert moved[2] < -0.015
     assert np.linalg.norm(moved[:2]) < 0.1 * abs(moved[2])
-    assert bench.said["right"] == {Status.NO_WARNING}
+    assert bench.said["right"] == {ServoState.NO_WARNING}
 
 
 @pytest.mark.long
@@ -147,7 +147,11 @@ def test_at_full_speed_towards_the_table_an_arm_slows_and_what_it_holds_stops_ov
     bench.ticks(300, {"right": towards([0.0, 0.0, -1.0])})
 
     assert bench.overlaps() == []
-    assert bench.said["right"] & {Status.HALT_FOR_COLLISION, Status.JOINT_BOUND, Status.HALT_FOR_SINGULARITY}
+    assert bench.said["right"] & {
+        ServoState.HALT_FOR_COLLISION,
+        ServoState.JOINT_BOUND,
+        ServoState.HALT_FOR_SINGULARITY,
+    }
     assert bench.tool("right")[2] > top
 
 
@@ -157,7 +161,7 @@ def test_arms_sent_towards_each_other_stop_apart(bench):
         bench.tick({"right": towards(way), "left": towards(-way)})
 
     assert bench.overlaps() == []
-    assert Status.HALT_FOR_COLLISION in bench.said["right"] | bench.said["left"]
+    assert ServoState.HALT_FOR_COLLISION in bench.said["right"] | bench.said["left"]
 
 
 def test_a_joint_stops_before_its_limit(bench, arms):
@@ -165,7 +169,7 @@ def test_a_joint_stops_before_its_limit(bench, arms):
 
     arm = arms["left"]
     assert bench.q["left"][4] <= arm.upper[4] - CONFIG.joint_limit_margin + 1e-6
-    assert bench.servos["left"].report.status in (Status.JOINT_BOUND, Status.HALT_FOR_COLLISION)
+    assert bench.servos["left"].report.status in (ServoState.JOINT_BOUND, ServoState.HALT_FOR_COLLISION)
     assert np.max(bench.tracks["left"], axis=0)[4] > bench.tracks["left"][0][4] + 0.3
 
 
@@ -202,7 +206,7 @@ def test_when_commands_cease_the_set_point_begins_to_slow_within_50_ms_and_every
 
 def test_a_stretched_arm_stops_at_the_singular_posture_and_comes_back(bench):
     bench.ticks(250, {"right": towards([1.0, -0.2, 0.3])})
-    assert bench.said["right"] & {Status.HALT_FOR_SINGULARITY, Status.JOINT_BOUND}
+    assert bench.said["right"] & {ServoState.HALT_FOR_SINGULARITY, ServoState.JOINT_BOUND}
     out = bench.tool("right")
 
     bench.ticks(150, {"right": towards([-1.0, 0.2, -0.3])})
@@ -213,14 +217,14 @@ def test_a_stretched_arm_stops_at_the_singular_posture_and_comes_back(bench):
 def test_an_arm_that_does_not_follow_gets_no_set_points_until_commands_pause(bench, arms):
     bench.stuck.add("right")
     bench.ticks(60, {"right": turning(0.5)})
-    assert bench.servos["right"].report.status is Status.INVALID
+    assert bench.servos["right"].report.status is ServoState.INVALID
     assert arms["right"].names[4] in bench.servos["right"].report.text
     bench.stuck.clear()
     bench.ticks(60, {})
 
     bench.ticks(60, {"right": turning(0.5)})
 
-    assert bench.servos["right"].report.status is Status.NO_WARNING
+    assert bench.servos["right"].report.status is ServoState.NO_WARNING
 
 
 def test_joint_velocities_are_those_of_the_twist(right):

@@ -14,19 +14,19 @@ from openarm_common.robot.servos import ArmLoad
 from openarm_common.robot.turns import nearest_turns, other_ways
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, box_from
-from openarm_motion.config import LimitsConfig, MotionConfig, PlanningConfig, ServoConfig
+from openarm_motion.config import MotionConfig, MotionLimits, PlanningConfig, ServoingConfig
 from openarm_motion.constraints.asked import CartesianGoal, RegionGoal
 from openarm_motion.constraints.cartesian import along
 from openarm_motion.constraints.plans import to_region
 from openarm_motion.constraints.queries import at_pose, solve
-from openarm_motion.constraints.regions import JointInterval, Region
+from openarm_motion.constraints.regions import JointInterval, TaskRegion
 from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.planning import moves
 from openarm_motion.planning.approach import ApproachRequest, Target, plan_approach
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.moves import RequestBoxes
-from openarm_motion.servo.arm_servo import ArmServo, Command
+from openarm_motion.servo.arm_servo import ArmServo, ServoCommand
 from openarm_motion.servo.surroundings import Surroundings
 from openarm_motion.timing.checks import check_trajectory
 from openarm_motion.timing.trajectory import Motion
@@ -40,7 +40,7 @@ ENDS = (0, -1)
 
 def made(name: str, description: RobotDescription, planner: str = "fast") -> Arm:
     n = len(BENT[name])
-    limits = LimitsConfig(velocity=(1.0,) * n, acceleration=(3.0,) * n, jerk=(30.0,) * n)
+    limits = MotionLimits(velocity=(1.0,) * n, acceleration=(3.0,) * n, jerk=(30.0,) * n)
     planning = PlanningConfig(planner=planner, time_limit=4.0)
     config = MotionConfig(arms=(name,), tool_link="tool", group="{arm}", limits=limits, planning=planning, scene="")
     return Arm(name, description, config)
@@ -170,11 +170,11 @@ def test_constraints_of_a_joint_hold_in_any_turn(arm: Arm) -> None:
     now = arm.start_state(dict(zip(arm.names, start.tolist(), strict=True)))
     there = zip(arm.names, at(arm, -3.1, 0.5).tolist(), strict=True)
     wanted = [JointInterval(name, q, 0.01, 0.01, upper=upper[name]) for name, q in there]
-    path = Region((JointInterval(arm.names[0], -math.pi, 0.2, 0.2, upper=math.inf),))
-    q = to_region(arm, now, RegionGoal((Region(tuple(wanted)),), path), RequestBoxes()).q
+    path = TaskRegion((JointInterval(arm.names[0], -math.pi, 0.2, 0.2, upper=math.inf),))
+    q = to_region(arm, now, RegionGoal((TaskRegion(tuple(wanted)),), path), RequestBoxes()).q
     np.testing.assert_allclose(q[-1, list(ENDS)], [2 * math.pi - 3.1, 4 * math.pi + 0.5], atol=1e-9)
     pose = arm.kinematics.fk(at(arm, -3.1, 0.5))
-    q = solve(arm, now, RequestBoxes(), at_pose(pose, Region((wanted[0],))), avoid_collisions=True)
+    q = solve(arm, now, RequestBoxes(), at_pose(pose, TaskRegion((wanted[0],))), avoid_collisions=True)
     assert abs(q[0] - (2 * math.pi - 3.1)) < 0.02
     np.testing.assert_allclose(arm.kinematics.fk(q), pose, atol=1e-3)
 
@@ -191,14 +191,14 @@ def test_a_trajectory_of_another_turn_is_sent_in_the_turn_that_the_arm_is_in(arm
 def test_servoing_turns_on_across_the_seam(arm: Arm) -> None:
     q = at(arm, 0.0, 3.0)
     state = dict(zip(arm.names, q.tolist(), strict=True))
-    config = ServoConfig()
+    config = ServoingConfig()
     around = Surroundings.of([arm], arm.start_state(state), [()], config.clearance, config.lag)
     servo, t_ns, sent = ArmServo(arm, config, 0.05), 1_000_000_000, list[tuple[Motion, int]]()
     jog = np.zeros(arm.kinematics.n)
     jog[-1] = 1.0
     for _ in range(150):
         t_ns += 10_000_000
-        servo.take(Command(jog, t_ns * 1e-9, is_twist=False))
+        servo.take(ServoCommand(jog, t_ns * 1e-9, is_twist=False))
         wrapped = (q + math.pi) % math.tau - math.pi  # of an encoder that knows one turn
         found = servo.tick(t_ns, t_ns * 1e-9, (t_ns, wrapped), around, {})
         sent += [] if found is None else [found]

@@ -14,7 +14,7 @@ import yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.folder import read_folder
-from openarm_motion.config import LimitsConfig, MotionConfig
+from openarm_motion.config import MotionConfig, MotionLimits
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.moves import RequestBoxes, to_joints
 from openarm_sim_bridge.drafting.check import folder_faults
@@ -136,7 +136,7 @@ def test_an_arm_without_a_hand_is_a_robot_to_plan_for(parts: Path) -> None:
     assert (robot.arm("bare").controlled, robot.hands) == (("lift",), {})
     with pytest.raises(OpenArmError, match="'bare' of robot 'bare' has no hand"):
         robot.hand("bare")
-    config = MotionConfig(limits=LimitsConfig(velocity=(1.0,), acceleration=(3.0,), jerk=(30.0,)))
+    config = MotionConfig(limits=MotionLimits(velocity=(1.0,), acceleration=(3.0,), jerk=(30.0,)))
     arm = Arm("bare", robot, config)
     assert to_joints(arm, arm.start_state({"lift": 0.0}), [0.5], RequestBoxes()).q[-1].tolist() == [0.5]
 

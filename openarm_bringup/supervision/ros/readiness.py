@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 
 from openarm_bringup.messages import interface
 from openarm_bringup.supervision.graph import Ready
-from openarm_common.ros.actions import Watch
+from openarm_common.ros.actions import ServerWatch
 from openarm_common.ros.client import ContextNode
 from openarm_common.ros.node import reliable
 from openarm_common.ros.polled import Polled, Source
@@ -60,7 +60,7 @@ class ReadinessClient(ContextNode):
         super().__init__(f"openarm_probe_{os.getpid()}", domain=int(environ["ROS_DOMAIN_ID"]))
         self._waiting: dict[str, Subscription] = {}
         self._received: set[str] = set()
-        self._watches: dict[str, Watch] = {}
+        self._watches: dict[str, ServerWatch] = {}
         self._listing: dict[str, _Listing] = {}
         self._diagnostics = Polled(self._node, Source(DiagnosticArray, "/diagnostics", reliable(100)))
         self._troubles: dict[str, str] = {}
@@ -81,7 +81,7 @@ class ReadinessClient(ContextNode):
     def silence(self, node: str) -> float:
         """Return for how long a node whose process lives has shown no sign of life, s."""
         if node not in self._watches:
-            self._watches[node] = Watch(self._node, "", node, f"/{node}")
+            self._watches[node] = ServerWatch(self._node, "", node, f"/{node}")
         return self._watches[node].silence
 
     def trouble(self, node: str) -> str:

@@ -29,7 +29,7 @@ from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, pose_to_matr
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Cylinder, Mesh, Solid, Sphere
 from openarm_motion.constraints.names import RobotNames
-from openarm_motion.constraints.regions import JointInterval, OrientationRegion, PositionRegion, Region, Volume
+from openarm_motion.constraints.regions import JointInterval, OrientationRegion, PositionRegion, TaskRegion, Volume
 from openarm_motion.ros.move_group.codes import MoveItError
 from openarm_motion.timing.trajectory import Motion
 
@@ -71,20 +71,20 @@ class Converter:
         self._description, self._names, self.in_base = description, names, in_base
 
     # --- constraints
-    def region(self, message: Constraints, arm: str) -> Region:
+    def region(self, message: Constraints, arm: str) -> TaskRegion:
         """The region of an arm's configurations that constraints describe.
 
         Raises:
             MoveItError: INVALID_GOAL_CONSTRAINTS or INVALID_LINK_NAME, saying what is wrong.
         """
         with as_moveit(MoveItErrorCodes.INVALID_GOAL_CONSTRAINTS):
-            return Region(
+            return TaskRegion(
                 tuple(self._interval(joint) for joint in message.joint_constraints),
                 tuple(self._position(part, arm) for part in message.position_constraints),
                 tuple(self._orientation(part, arm) for part in message.orientation_constraints),
             )
 
-    def regions(self, message: Constraints, arms: Sequence[str]) -> tuple[Region, ...]:
+    def regions(self, message: Constraints, arms: Sequence[str]) -> tuple[TaskRegion, ...]:
         """The region of each of the arms of a group; what a constraint is of says which arm it is for.
 
         Raises:

@@ -16,7 +16,7 @@ from openarm_common.ros.actions import ActionClient, run_goal
 from openarm_common.ros.node import BaseNode
 from openarm_motion.config import MoveGroupConfig
 from openarm_motion.ros.move_group.codes import MoveItError
-from openarm_motion.service.robot import Watch
+from openarm_motion.service.robot import RobotWatch
 from openarm_motion.timing.trajectory import Motion
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class Hands:
         else:
             goal = ParallelGripperCommand.Goal()
             goal.command.name, goal.command.position = [finger], [position]
-        watch = Watch(self._service.robot)
+        watch = RobotWatch(self._service.robot)
         result = await run_goal(client, goal, lambda done, limit: watch.until(done, limit=limit), stopped=stopped)
         if stopped():
             raise OpenArmError(Code.CANCELLED, f"cancelled; the {arm} hand holds where it is")

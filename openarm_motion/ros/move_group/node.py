@@ -43,13 +43,12 @@ from std_msgs.msg import String
 from std_srvs.srv import Empty
 
 from openarm_common import se3
-from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.convert import matrix_to_pose, stamp_to_ns, trajectory_from_msg
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, BaseNode
 from openarm_motion.collision.exact import Contact, body_of
-from openarm_motion.config import MoveGroupConfig
+from openarm_motion.config import MoveGroupConfig, NoParameters
 from openarm_motion.constraints.cartesian import CartesianPath
 from openarm_motion.constraints.names import RobotNames
 from openarm_motion.constraints.queries import at_pose, judge, link_poses, solve
@@ -68,10 +67,6 @@ if TYPE_CHECKING:
     from openarm_motion.service.motion_service import MotionService
 
 ResponseT = TypeVar("ResponseT")
-
-
-class NoParameters(Config):
-    """The parameters are those of the motion node, `move_group.*`."""
 
 
 class MoveGroupNode(BaseNode[NoParameters]):

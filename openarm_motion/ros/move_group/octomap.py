@@ -23,7 +23,7 @@ from openarm_common.printable import brief
 from openarm_common.ros.convert import matrix_to_pose
 from openarm_common.ros.node import BaseNode
 from openarm_motion.scene.octree import SceneOctree
-from openarm_motion.service.robot import Watch
+from openarm_motion.service.robot import RobotWatch
 
 if TYPE_CHECKING:
     from openarm_motion.ros.move_group.convert import Converter
@@ -59,7 +59,7 @@ class SceneOctomap:
         if self._service.config.map.use == "off" or not self._map.service_is_ready():
             return out
         asked = self._map.call_async(GetOctomap.Request())
-        if not await Watch(self._service.robot).until(asked.done, limit=_ANSWER):
+        if not await RobotWatch(self._service.robot).until(asked.done, limit=_ANSWER):
             self._map.remove_pending_request(asked)
             self._node.get_logger().warning(f"{self._map.srv_name} did not answer within {_ANSWER:g} s")
             return out

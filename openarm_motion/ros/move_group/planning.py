@@ -19,7 +19,7 @@ from openarm_motion.constraints.asked import CartesianGoal, RegionGoal
 from openarm_motion.ros.move_group.codes import MoveItError
 from openarm_motion.ros.move_group.convert import Converter, as_moveit
 from openarm_motion.ros.move_group.fields import CARTESIAN, EXECUTE, PLAN, check_fields
-from openarm_motion.scene.bodies import Body, boxes_about
+from openarm_motion.scene.bodies import SceneBody, boxes_about
 from openarm_motion.service.requests import ArmGoal, MoveArmsRequest, MoveRequest
 from openarm_motion.timing.trajectory import Motion
 
@@ -212,7 +212,7 @@ class Requests:
             state = {**self._service.robot.states.latest()[1], **self._convert.state(message.start_state)}
             kinematics = self._service.arms[arm].kinematics
             T_base_tool = kinematics.fk(np.array([state[name] for name in kinematics.names]))
-            out[arm] += tuple(boxes_about(Body(body.id, T, shapes).moved(se3.inverse(T_base_tool))))
+            out[arm] += tuple(boxes_about(SceneBody(body.id, T, shapes).moved(se3.inverse(T_base_tool))))
         return out
 
     def check_touch(self, links: list[str], arm: str) -> None:

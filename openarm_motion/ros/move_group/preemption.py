@@ -7,7 +7,7 @@ from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import asynccontextmanager
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.service.robot import RobotInterface, Watch
+from openarm_motion.service.robot import RobotInterface, RobotWatch
 
 #: Joints that change by less in this time rest, rad or m and ns; after a goal was ended they have so long for it, s.
 _STILL, _OVER_NS, _LONGEST = 2e-3, 100_000_000, 3.0
@@ -45,8 +45,8 @@ class Preemption:
         stopped = lambda: cancelled() or newer()  # noqa: E731
         try:
             if not self._moving.isdisjoint(joints):
-                await Watch(self._robot).until(lambda: stopped() or self._moving.isdisjoint(joints))
-                await Watch(self._robot).until(lambda: stopped() or self._rest(joints), limit=_LONGEST)
+                await RobotWatch(self._robot).until(lambda: stopped() or self._moving.isdisjoint(joints))
+                await RobotWatch(self._robot).until(lambda: stopped() or self._rest(joints), limit=_LONGEST)
             if stopped():
                 raise OpenArmError(Code.CANCELLED, "cancelled before it began")
             self._moving.update(joints)

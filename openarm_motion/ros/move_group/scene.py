@@ -29,7 +29,7 @@ from openarm_motion.ros.move_group.codes import MoveItError
 from openarm_motion.ros.move_group.convert import Converter, as_moveit, object_msg, state_msg
 from openarm_motion.ros.move_group.fields import ATTACHED, OBJECT, SCENE, check_fields
 from openarm_motion.ros.move_group.octomap import SceneOctomap
-from openarm_motion.scene.bodies import Body, Draft, SceneBodies
+from openarm_motion.scene.bodies import SceneBodies, SceneBody, SceneDraft
 
 if TYPE_CHECKING:
     from openarm_motion.constraints.names import RobotNames
@@ -185,7 +185,7 @@ class SceneServer:
         self._attach(draft, message)
         await self._apply(draft)
 
-    async def _apply(self, draft: Draft) -> None:
+    async def _apply(self, draft: SceneDraft) -> None:
         with as_moveit(MoveItErrorCodes.INVALID_OBJECT_NAME):
             self._bodies.apply(draft)
         await self._changed()
@@ -204,7 +204,7 @@ class SceneServer:
                     MoveItErrorCodes.INVALID_ROBOT_STATE, f"{text}: the scene is that of the robot as it is"
                 )
 
-    def _put(self, draft: Draft, message: CollisionObject) -> None:
+    def _put(self, draft: SceneDraft, message: CollisionObject) -> None:
         with as_moveit(MoveItErrorCodes.INVALID_OBJECT_NAME):
             if message.operation == CollisionObject.REMOVE:
                 draft.remove(message.id)
@@ -224,9 +224,9 @@ class SceneServer:
                 raise OpenArmError(Code.INVALID_ARGUMENT, text)
             if not shapes:
                 raise OpenArmError(Code.INVALID_ARGUMENT, f"object {message.id!r} has no primitives and no meshes")
-            draft.put(Body(message.id, T, shapes), append=message.operation == CollisionObject.APPEND)
+            draft.put(SceneBody(message.id, T, shapes), append=message.operation == CollisionObject.APPEND)
 
-    def _attach(self, draft: Draft, message: AttachedCollisionObject) -> None:
+    def _attach(self, draft: SceneDraft, message: AttachedCollisionObject) -> None:
         body = message.object
         if body.operation == CollisionObject.REMOVE:
             with as_moveit(MoveItErrorCodes.INVALID_OBJECT_NAME):
@@ -249,7 +249,7 @@ class SceneServer:
                 )
                 raise OpenArmError(Code.INVALID_ARGUMENT, text)
             T, shapes = self._convert.shapes(body)
-            draft.attach(body.id, arm, self._tool(arm), Body(body.id, T, shapes) if shapes else None)
+            draft.attach(body.id, arm, self._tool(arm), SceneBody(body.id, T, shapes) if shapes else None)
 
     def _carries(self, arm: str, message: AttachedCollisionObject) -> bool:
         return not message.link_name or message.link_name in self._names.links_on_tool(arm)
@@ -261,7 +261,7 @@ class SceneServer:
         kinematics = self._service.arms[arm].kinematics
         return kinematics.fk(np.array([state[name] for name in kinematics.names]))
 
-    def _allowed(self, matrix: AllowedCollisionMatrix, draft: Draft) -> frozenset[frozenset[str]]:
+    def _allowed(self, matrix: AllowedCollisionMatrix, draft: SceneDraft) -> frozenset[frozenset[str]]:
         """Pairs of a matrix that may touch, but for those of the SRDF, which can't be taken back."""
         names = [MAP if name == _OCTOMAP else name for name in matrix.entry_names]
         rows = [list(entry.enabled) for entry in matrix.entry_values]
