@@ -98,6 +98,8 @@ class ArmKinematics:
         self.span = description.limits(self.names, np.pi)
         _, placements, axes, prismatic = tree.arrays
         self.placements, self.axes, self.prismatic = placements[rows], axes[rows], prismatic[rows]
+        #: The chain as the kernels take it.
+        self.chain: TreeArrays = (np.arange(len(rows)), self.placements, self.axes, self.prismatic)
         self.tip: Array = tree.fixed[tool_link]
         slides = np.where(self.prismatic, np.maximum(np.abs(self.lower), np.abs(self.upper)), 0.0)
         offsets = np.linalg.norm([*self.placements[1:, :3, 3], self.tip[:3, 3]], axis=1)
@@ -113,11 +115,6 @@ class ArmKinematics:
     def middle(self) -> Array:
         """Middle (n,) of the limits; 0 of a joint that has none."""
         return 0.5 * (self.span[0] + self.span[1])
-
-    @property
-    def chain(self) -> TreeArrays:
-        """The chain as the kernels take it."""
-        return np.arange(self.n), self.placements, self.axes, self.prismatic
 
     def fk(self, q: ArrayLike) -> Array:
         """`T_base_tool` (4, 4) of a configuration (n,)."""
