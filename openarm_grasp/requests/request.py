@@ -39,7 +39,7 @@ class GraspRequest:
 
     Attributes:
         label: Object to pick: attributes of it, or words that `openarm_common.wanted` knows; "" fits any.
-        selection: Which of those that fit is taken, of `openarm_common.wanted.SELECTIONS`.
+        selection: Selection among those that fit, of `openarm_common.wanted.SELECTIONS`.
         arm: "auto", "left" or "right".
         place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
         dry_run: Plan and report, do not move.
