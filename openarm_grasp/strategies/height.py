@@ -15,7 +15,7 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.feasibility import FeasibilityCheck
-from openarm_grasp.planning.options import NO_WAY, refusals
+from openarm_grasp.planning.options import refusals
 from openarm_grasp.requests.confirm import GRASP, agree_once
 from openarm_grasp.requests.request import Feasible, GraspOutcome
 from openarm_grasp.requests.task import Task
@@ -90,13 +90,9 @@ async def _planned(task: Task, found: Sighting, position: float) -> Height:
     Raises:
         OpenArmError: One of `NO_WAY`; what the robot raises.
     """
-    feasible, fault = FeasibilityCheck(task.robot, task.context), OpenArmError(Code.UNREACHABLE, "no arm")
+    feasible, faults = FeasibilityCheck(task.robot, task.context), list[str]()
     for arm in task.context.arm_order("auto", float(found.target.p_base[1])):
-        try:
+        with refusals(faults):
             plan = await feasible.grasp(arm, found, at_height=position)
             return Height(position, task.robot.lift_position(), arm, plan)
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-            fault = error
-    raise fault
+    raise OpenArmError(Code.UNREACHABLE, faults[-1])
