@@ -23,7 +23,7 @@ _PIXEL = 0.002
 _HALF = 600
 #: Steps of the search for a motion, m; rounds of each; more points say nothing new.
 _STEPS, _ROUNDS, _POINTS = (0.008, 0.004, 0.002, 0.001), 8, 500
-#: Motions whose scores, share seen less share seen through, differ by less explain an image as well.
+#: Motions whose shares seen differ by less explain an image as well.
 _AS_WELL = 0.01
 
 
@@ -75,11 +75,9 @@ def fit(
     *,
     turns: bool = True,
 ) -> tuple[Array, Shares]:
-    """Find the motion (4, 4) near to one that explains an image best, and the shares.
+    """Find the motion (4, 4) near to one with which most points are seen, and the shares.
 
-    Points that are seen speak for a motion, those that are seen through against it: a face that the camera looks along
-    is in view only where it is too far out. By coordinate descent, and then to the middle of what explains the image as
-    well. Where something has come to rest a
+    By coordinate descent, and then to the middle of what explains the image as well. Where something has come to rest a
     little elsewhere, or its camera is a little elsewhere than believed, the motion says by how much, and the shares
     judge the shape.
 
@@ -98,8 +96,7 @@ def fit(
         return se3.make(se3.rot_z(x[3] / reach), middle + x[:3]) @ se3.make(p=-middle) @ T_motion
 
     def score(x: Array) -> float:
-        shares = explain(some, moved(x), view, config)
-        return shares.seen - shares.free
+        return explain(some, moved(x), view, config).seen
 
     x, axes = np.zeros(4), np.eye(4)[: 3 + turns]
     best = score(x)

@@ -9,6 +9,7 @@ nor that it has gone.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -31,6 +32,8 @@ AS_HIGH = 0.005
 _MOVED = 0.1
 #: What is less in view is not judged: from another side, a third may be.
 _SHOWN = 0.3
+#: A motion is fitted to so much, horizontally, m (95 %): a face that the camera looks along is seen through by less.
+_FITTED = 0.003
 #: Of the points of a thing that has not moved so many lie where it was, %: the rest may be the edge of the hand.
 _MOST = 85.0
 #: Fewer points of what hangs in a hand may be of its edge, or of something else.
@@ -164,7 +167,10 @@ def judge_moved(
     """
     if frame.cloud is None or not len(before):
         return T_motion, CameraVerdict(Code.STALE_DATA, "no points of what stands where it was put down")
-    T, shares = fit(before, T_motion, view_of(frame.cloud.points, frame.cloud.camera), turns=not in_part)
+    view = view_of(frame.cloud.points, frame.cloud.camera)
+    T, fitted = fit(before, T_motion, view, turns=not in_part)
+    near = (se3.make(p=(_FITTED * x, _FITTED * y, 0.0)) @ T for x, y in product((-1.0, 0.0, 1.0), repeat=2))
+    shares = min((fitted, *(explain(before, each, view) for each in near)), key=lambda each: each.left)
     shift = (se3.apply(T, before) - se3.apply(T_motion, before)).mean(axis=0)
     off, higher = float(np.linalg.norm(shift[:2])), float(shift[2])
     text, final = f"what was seen of it is {off * 1e3:.0f} mm from where it was put down", False
