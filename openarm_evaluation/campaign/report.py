@@ -257,7 +257,8 @@ def time_lines(rows: Sequence[Row]) -> bytes:
     axes.set_yticks(range(len(lines)), lines)
     axes.invert_yaxis()
     axes.set_xlabel("robot time, s")
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines.top.set_visible(False)
+    axes.spines.right.set_visible(False)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5, frameon=False, fontsize="small")
     return render_figure(axes, "svg", margin=4.0)
 

@@ -26,7 +26,7 @@ def settings(folder: Path) -> list[Reader]:
     from openarm_common.config import load_config, parse_yaml
     from openarm_common.scene.scene import load_scene
     from openarm_evaluation.detector.yolo_text import read_classes
-    from openarm_grasp.requests.orders import load_bins
+    from openarm_grasp.requests.bins import load_bins
     from openarm_perception.detection.detector import ColorDetectorConfig
     from openarm_sim_bridge.faults.faults import FAULTS, parse_fault
 
