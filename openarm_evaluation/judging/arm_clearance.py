@@ -71,7 +71,8 @@ class ArmClearance:
             i, j = np.unravel_index(flat, bound.shape)
             if bound[i, j] >= best:
                 break
-            best = min(best, mujoco.mj_geomDistance(model, data, int(first[i]), int(second[j]), 2.0, None))
+            found = mujoco.mj_geomDistance(model, data, int(first[i]), int(second[j]), 2.0, None)
+            best = min(best, max(found, float(bound[i, j])))  # in some postures MuJoCo says 0 of shapes far apart
         return best
 
 

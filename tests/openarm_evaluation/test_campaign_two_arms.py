@@ -87,6 +87,14 @@ def test_the_judge_of_the_gap_measures_what_mujoco_measures_pair_by_pair() -> No
     assert gap.least == pytest.approx(min(pairs), abs=0.01)
 
 
+def test_arms_are_no_nearer_than_the_spheres_about_their_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
+    gap = ArmClearance(robot.description, robot.world.model)
+    true = gap.distance(robot.world.data)
+    monkeypatch.setattr(mujoco, "mj_geomDistance", lambda *_: 0.0)
+    assert 0.05 < gap.distance(robot.world.data) <= true
+
+
 def test_the_gap_of_joint_states_is_that_of_the_simulation_which_they_come_from() -> None:
     robot, table = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False)), robot_work().table
     home = robot.states.latest()[1]
