@@ -17,6 +17,7 @@ from openarm_bringup.commands import connect, pick
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import Option
+from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.ros.client import GraspResult
 from tests.openarm_bringup.commands import record_of
 
@@ -80,8 +81,8 @@ class Client:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def pick(self, **asked: Any) -> GraspResult:
-        self.asked = asked
+    def carry_out(self, request: GraspRequest, **asked: Any) -> GraspResult:
+        self.asked = {"request": request, **asked}
         plan = GraspStatus(
             state="PLAN", plan_id="4adc", reason="grasp red; 12.0 s of motion; plan '4adc' waits for /grasp/confirm"
         )
@@ -138,20 +139,20 @@ def test_without_a_terminal_a_plan_waits_for_the_service(
 def test_an_order_lists_what_is_left_with_place_and_reason(
     client: Client, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    asked, cups, lock = list[dict[str, Any]](), ["cup"], threading.Lock()
+    asked, cups, lock = list[GraspRequest](), ["cup"], threading.Lock()
 
-    def answer(label: str, **more: Any) -> GraspResult:
+    def answer(request: GraspRequest, **_: Any) -> GraspResult:
         nowhere, wide = (0.0, 0.0, 0.0), (0.2, 0.1)
         with lock:
-            asked.append({"label": label, **more})
-            if more["phase"] == "all" and cups:
+            asked.append(request)
+            if request.phase == "all" and cups:
                 return GraspResult(True, Code.OK, "placed", "SUCCESS", cups.pop(), "left", 1, (0.2, 0.3, 0.4), 9.0,
                                    (0.3, 0.0, 0.42))  # fmt: skip
-        if more["phase"] == "all" and wide not in more["exclude_near"]:
+        if request.phase == "all" and wide not in request.exclude_near:
             return GraspResult(False, Code.TOO_WIDE, "190 mm", "REFUSED", "", "", 0, nowhere, 1.0, (*wide, 0.45))
         return GraspResult(False, Code.UNKNOWN_OBJECT, "no more", "REFUSED", "", "", 0, nowhere, 1.0)
 
-    monkeypatch.setattr(client, "pick", answer)
+    monkeypatch.setattr(client, "carry_out", answer)
     bins = tmp_path / "bins.yaml"
     bins.write_text("bins: {tray: {x: [0.15, 0.25], y: [0.2, 0.44]}}\nrest: tray\n")
     outcome = pick.order("anything", bins=bins)
@@ -161,10 +162,10 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     data = json.loads(json.dumps(outcome.data, allow_nan=False))
     assert data["left"][0]["where"] == [0.2, 0.1]
     assert [row["place"] for row in data["results"] if row["place"]] == [[0.2, 0.3, 0.4]]
-    first = {one["arm"]: one["place_choices"] for one in asked if not one["exclude_near"]}
+    first = {one.arm: one.place_choices for one in asked if not one.exclude_near}
     assert first == {"left": ((0.2, 0.26), (0.2, 0.38)), "right": ((0.2, 0.38), (0.2, 0.26))}
-    assert {one["arm"] for one in asked if {(0.2, 0.3), (0.2, 0.1)} <= {*one["exclude_near"]}} == {"left", "right"}
-    assert (asked[-1]["object_at"], asked[-1]["phase"], asked[-1]["arm"]) == ((0.2, 0.1), "aside", "auto")
+    assert {one.arm for one in asked if {(0.2, 0.3), (0.2, 0.1)} <= {*one.exclude_near}} == {"left", "right"}
+    assert (asked[-1].object_at, asked[-1].phase, asked[-1].arm) == ((0.2, 0.1), "aside", "auto")
 
 
 @pytest.mark.requirement("P-21")
@@ -173,10 +174,10 @@ def test_ctrl_c_cancels_all_that_an_order_has_asked_for_and_waits_for_its_end(
 ) -> None:
     stop, ended = threading.Event(), list[str]()
 
-    def answer(label: str, *, arm: str, **_: Any) -> GraspResult:
+    def answer(request: GraspRequest, **_: Any) -> GraspResult:
         assert stop.wait(10.0)
-        ended.append(arm)
-        return GraspResult(False, Code.CANCELLED, "cancelled", "CANCELLED", "", arm, 0, (0.0, 0.0, 0.0), 1.0)
+        ended.append(request.arm)
+        return GraspResult(False, Code.CANCELLED, "cancelled", "CANCELLED", "", request.arm, 0, (0.0, 0.0, 0.0), 1.0)
 
     waits = [KeyboardInterrupt()]
 
@@ -185,7 +186,7 @@ def test_ctrl_c_cancels_all_that_an_order_has_asked_for_and_waits_for_its_end(
             raise waits.pop()
         return futures.wait(*args, **kwargs)
 
-    monkeypatch.setattr(client, "pick", answer)
+    monkeypatch.setattr(client, "carry_out", answer)
     monkeypatch.setattr(client, "cancel", stop.set, raising=False)
     monkeypatch.setattr(pick, "wait", wait)
     outcome = pick.order("anything")
@@ -198,11 +199,11 @@ def test_an_order_whose_grasp_node_is_gone_ends_with_the_reason(
 ) -> None:
     stop = threading.Event()
 
-    def answer(label: str, *, arm: str, **_: Any) -> GraspResult:
-        assert arm == "left" or stop.wait(10.0)
-        raise OpenArmError(Code.NOT_READY, f"the server of the {arm} arm is gone")
+    def answer(request: GraspRequest, **_: Any) -> GraspResult:
+        assert request.arm == "left" or stop.wait(10.0)
+        raise OpenArmError(Code.NOT_READY, f"the server of the {request.arm} arm is gone")
 
-    monkeypatch.setattr(client, "pick", answer)
+    monkeypatch.setattr(client, "carry_out", answer)
     monkeypatch.setattr(client, "cancel", stop.set, raising=False)
     with pytest.raises(OpenArmError, match="left arm is gone"):
         pick.order("anything")
