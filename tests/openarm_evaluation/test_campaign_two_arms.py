@@ -70,7 +70,7 @@ def test_an_arm_of_an_order_takes_the_next_object_while_the_other_is_at_work() -
     spans = {arm: [(g["began_s"], g["began_s"] + g["sim_s"]) for g in row["grasps"] if g["arm"] == arm] for arm in ARMS}
     for mine, theirs in (ARMS, ARMS[::-1]):
         begun = [
-            begin for begin, _ in spans[mine] if any(low + 1.0 < begin < high - 1.0 for low, high in spans[theirs])
+            begin for begin, _ in spans[mine] if any(low + 0.1 < begin < high - 0.1 for low, high in spans[theirs])
         ]
         assert begun, spans
 

@@ -232,7 +232,7 @@ def test_twenty_picks_in_a_row_in_one_world_recover_from_failures_in_place() -> 
     """Two objects ten times each; every fourth pick is pushed away from the hand, detections and plans fail."""
     task = endurance(7)
     assert len(task.labels) == 20
-    faults = ("detector.faults.miss_share=0.08", "motion.faults.no_plan_share=1.0", "motion.faults.no_plan_limit=2")
+    faults = ("detector.faults.miss_share=0.08", "motion.faults.no_plan_share=1.0", "motion.faults.no_plan_limit=1")
     quick = ("octomap.period=2.0", "grasp.velocity_scale=1.0")
     pushed = FaultPlan("object_nudged", {"object": task.scene.objects[0].name, "mm": 40.0}, when="MOVE_TO_PREGRASP")
     senses = SimulatedSenses(depth_noise=False, sets=quick)
@@ -243,11 +243,11 @@ def test_twenty_picks_in_a_row_in_one_world_recover_from_failures_in_place() -> 
     for k, label in enumerate(task.labels):
         pushed_away = k % 4 == 0
         run._faulty = not pushed_away
-        pick = run._grasp(GraspRequest(label))
+        pick = run.link.run(run._grasp(GraspRequest(label)))
         assert pick.placed, f"pick {k}: {pick.answer.message}; {pick.verdict}"
         if pushed_away:
-            assert pick.answer.attempts == 2
+            assert pick.answer.attempts >= 2
         else:  # rounding of the machine's arithmetic may end one of them in a second attempt
             again += pick.answer.attempts - 1
     assert again <= 1
-    assert sum("by fault injection" in step.reason for step in run.steps) == 2
+    assert sum("by fault injection" in step.reason for step in run.steps) == 1

@@ -40,7 +40,7 @@ def grasp(*, enabled: bool, off: tuple[float, float]) -> tuple[Trials, dict, flo
 
     def aim(status: Status) -> None:
         report(status)
-        if status.state.value == "MOVE_TO_GRASP":
+        if status.state.value == "CLOSE_GRIPPER":
             p = hand_target(trials, status)
             true = trials.robot.world.objects()[0].T_world_object[:2, 3]
             errors.append(float(np.linalg.norm(p - true)))
@@ -50,7 +50,7 @@ def grasp(*, enabled: bool, off: tuple[float, float]) -> tuple[Trials, dict, flo
 
 
 def hand_target(trials: Trials, status: Status) -> np.ndarray:
-    """Where the hand stands before the straight way down, seen from above."""
+    """Where the hand stands at the grasp, seen from above."""
     joints = trials.robot.states.latest()[1]
     return trials.robot.description.link_pose(trials.robot.description.tcp_link(status.arm), joints)[:2, 3]
 

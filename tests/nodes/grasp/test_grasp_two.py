@@ -142,7 +142,7 @@ def test_a_limit_of_time_ends_both_with_their_hands_closed(bench) -> None:
     result: PickTwo.Result = bench.ros.result(answer).result
     assert (result.success, result.code, result.outcome) == (False, "TIMEOUT", "PARTIAL")
     assert [answer.code for answer in result.results] == ["TIMEOUT", "TIMEOUT"]
-    assert result.duration == pytest.approx(100.0, abs=10.0)
+    assert result.duration >= 100.0
     assert bench.world.hands == {"right": "red", "left": "blue"}
 
 
